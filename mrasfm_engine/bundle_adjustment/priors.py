@@ -62,6 +62,12 @@ class CalibrationPrior:
         """This prior with the gauge's weights renewed from the corrections of a state."""
         return replace(self, gauge_weights=robust_gauge_weights(self._whitened(state)[0]))
 
+    def own_weights(self, state: State) -> Floats:
+        """Weights (c,) of the loss on each camera's correction: 1 for one as given, near 0 for one far from there."""
+        squared = (self._whitened(state)[0] ** 2).sum(axis=1)
+        result: Floats = 1.0 / (1.0 + squared / self.loss_scale**2)
+        return result
+
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
         return self.corrections(state) / sigma, sigma

@@ -7,7 +7,8 @@ standard deviation, the term costs
 
     min over d of  sum of rho(|e|^2) + d' P d        e = (t + R lever - measured - wander A d) / sigma
 
-where A interpolates linearly between knots and P is the precision of the process, which is tridiagonal. Its
+where A interpolates linearly between knots and P is the precision of the process, which is tridiagonal. Where the
+error jumps, the process begins anew: samples after a jump are later by a time in which it forgets everything. Its
 derivatives in the poses are those of e at the best d. Its Gauss-Newton matrix is J'WJ - G M^-1 G' with G = -J'W D,
 M = P + D'WD and D = wander A / sigma: the Schur complement of d, which `Extra.add_auxiliary` takes as G and M.
 """
@@ -37,6 +38,7 @@ AXES = 3
 MAX_KNOTS = 64  # of a drive: the width that they add to the reduced system is three times that
 MAX_REWEIGHTINGS = 30  # of the loss for one value of the poses
 SAME_WEIGHTS = 1e-7
+FORGOTTEN = 50.0  # correlation times, after which nothing is left: exp(-50)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +54,9 @@ class ReceiverPositions:
     wander_m: Floats  # (n, 3) standard deviations of the wandering part; 0 where there is none
     lever_arm_m: Floats  # (3,) in the rig frame
     time_s: Floats  # (n,)
-    knots_s: Floats  # (k,) ascending
+    knots_s: Floats  # (k,) ascending, of the process, see `time_of_process_s`
     wander_time_s: float  # correlation time of the wandering part
+    segment: Ints | None = None  # (n,) numbers of the parts between which the error jumps; None for one
     loss_scale: float = 3.0
 
     @staticmethod
@@ -67,21 +70,29 @@ class ReceiverPositions:
         lever_arm_m: Floats,
         wander_time_s: float,
         least_spacing_s: float,
+        segment: Ints | None = None,
     ) -> ReceiverPositions:
         """The term of samples (n,), in the order of time, with knots where they are needed.
+
+        `segment` (n,) numbers the parts between which the error jumps.
 
         Their errors (n, 3) have an independent and a wandering part. Knots are `least_spacing_s` apart, farther on
         drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that
         the samples between them share.
         """
-        span_s = float(np.ptp(time_s)) if len(time_s) else 0.0
-        spacing_s = max(least_spacing_s, span_s / (MAX_KNOTS - 1))
-        count = 1 + int(np.ceil(span_s / spacing_s - 1e-9))
-        first_s = float(time_s.min(initial=np.inf)) if len(time_s) else 0.0
-        knots_s: Floats = first_s + spacing_s * np.arange(count, dtype=np.float64)
+        of_process_s = time_of_process_s(time_s, segment, wander_time_s)
+        jumps = 1 + np.flatnonzero(np.diff(np.zeros(len(unit)) if segment is None else segment))
+        parts = np.split(of_process_s, jumps) if len(unit) else [np.zeros(1)]
+        spacing_s = max(least_spacing_s, float(sum(np.ptp(part) for part in parts)) / (MAX_KNOTS - 1))
+        knots_s: Floats = np.concatenate(
+            [
+                part.min() + spacing_s * np.arange(1 + int(np.ceil(np.ptp(part) / spacing_s - 1e-9)), dtype=np.float64)
+                for part in parts
+            ]
+        )
         # Variance half way between knots of unit variance, given both; samples share it while they are alike.
         half = np.exp(-0.5 * spacing_s / wander_time_s)
-        between = max(0.0, 1.0 + 0.5 * (1.0 + half**2) - 2.0 * half) if count > 1 else 0.0
+        between = max(0.0, 1.0 + 0.5 * (1.0 + half**2) - 2.0 * half) if len(knots_s) > len(parts) else 0.0
         step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
         sharing = max(1.0, min(spacing_s, 2.0 * wander_time_s) / step_s) if step_s > 0 else 1.0
         return ReceiverPositions(
@@ -93,6 +104,7 @@ class ReceiverPositions:
             time_s=time_s,
             knots_s=knots_s,
             wander_time_s=wander_time_s,
+            segment=segment,
         )
 
     def of_rows(self, rows: Ints, unit: Ints, share: Floats) -> ReceiverPositions:
@@ -104,16 +116,18 @@ class ReceiverPositions:
             sigma_m=self.sigma_m[rows] * share[:, None],
             wander_m=self.wander_m[rows],
             time_s=self.time_s[rows],
+            segment=None if self.segment is None else self.segment[rows],
         )
 
     @cached_property
     def _places(self) -> tuple[Ints, Ints, Floats]:
         """Knots (n,) before and after every sample, and the second's share (n,)."""
         last = len(self.knots_s) - 1
-        before = np.clip(np.searchsorted(self.knots_s, self.time_s, side="right") - 1, 0, max(last - 1, 0))
+        time_s = time_of_process_s(self.time_s, self.segment, self.wander_time_s)
+        before = np.clip(np.searchsorted(self.knots_s, time_s, side="right") - 1, 0, max(last - 1, 0))
         after = np.minimum(before + 1, last)
         length = np.where(after > before, self.knots_s[after] - self.knots_s[before], 1.0)
-        share = np.clip((self.time_s - self.knots_s[before]) / length, 0.0, 1.0) * (after > before)
+        share = np.clip((time_s - self.knots_s[before]) / length, 0.0, 1.0) * (after > before)
         return before, after, share
 
     @cached_property
@@ -231,6 +245,14 @@ class ReceiverPositions:
         known = self.information(np.concatenate([way[:, :, None], others], axis=2))
         lost = known[0, 1:] @ np.linalg.pinv(known[1:, 1:], rcond=1e-12, hermitian=True) @ known[1:, 0]
         return max(0.0, float(known[0, 0] - lost))
+
+
+def time_of_process_s(time_s: Floats, segment: Ints | None, wander_time_s: float) -> Floats:
+    """Times (n,) of the process that wanders, in which parts between jumps (n,) are long after one another."""
+    if segment is None:
+        return time_s
+    result: Floats = time_s + FORGOTTEN * wander_time_s * segment
+    return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

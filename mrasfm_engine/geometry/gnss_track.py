@@ -13,6 +13,8 @@ MAX_BEYOND_S = 0.5  # before the first and after the last sample nothing is know
 NEIGHBOURS = 5  # samples on each side that a sample is compared with
 NEIGHBOUR_SPAN_S = 3.0
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
+HARDEST_MPS2 = 10.0  # a vehicle accelerates and brakes by less
+BRAKING_S, HELD_SIGMAS = 1.0, 3.0  # before a receiver's last positions, which are all the same
 HEADING_WINDOWS_S = (0.5, 1.0, 2.0, 4.0, 8.0)  # half widths tried, the narrowest that shows a direction is used
 # Of roll, pitch, and the heading against the antenna's track: roads climb by up to 10 % and lean by some per cent, and
 # an antenna 1.5 m before the rear axle moves 3 degrees across the heading where the car turns on a radius of 30 m.
@@ -22,12 +24,17 @@ MIN_WAY_M, MIN_WAY_SIGMAS = 1.0, 6.0  # in a window, below which it may be the r
 
 @dataclass(frozen=True, kw_only=True)
 class GnssTrack:
-    """Positions of the antenna in a local east-north-up frame, ascending in time."""
+    """Positions of the antenna in a local east-north-up frame, ascending in time.
+
+    `swapped_from_local` (3, 3) takes them to where they would be with latitude and longitude swapped, but for a shift;
+    None where these would be no coordinates, or are not known.
+    """
 
     timestamps_us: Ints  # (n,)
     position_m: Floats  # (n, 3)
     sigma_m: Floats  # (n, 3)
     good: Bools  # (n,) False for gross errors
+    swapped_from_local: Floats | None = None
 
     def at(self, timestamps_us: Ints, *, max_gap_us: int) -> tuple[Floats, Floats]:
         """Positions and sigmas (m, 3) at other times, linear between good samples; NaN outside and in larger gaps."""
@@ -66,6 +73,30 @@ def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, 
         off = np.linalg.norm((position_m[i] - predicted) / sigma_m[i])
         bad[i] = off > outlier_sigmas and np.linalg.norm(position_m[i] - predicted) > MIN_JUMP_M
     return bad
+
+
+def find_held(timestamps_us: Ints, position_m: Floats, sigma_m: Floats) -> Bools:
+    """Mask (n,) of samples that repeat the one before them, to the last digit, while the vehicle drives on.
+
+    Loggers write a receiver's last position again until it has a new one, and receivers repeat theirs when they lose
+    their fix. The next position then lies farther away than a vehicle gets that moves off from where it stood; at the
+    end, where none follows, the vehicle was faster than any that brakes to a stop.
+    """
+    same = np.concatenate([[False], (np.diff(position_m, axis=0) == 0.0).all(axis=1)])
+    held, time_s = np.zeros(len(same), dtype=np.bool_), (timestamps_us - timestamps_us[0]) / 1e6
+    first = np.flatnonzero(~same)  # of each run
+    for begin, end in zip(first, [*first[1:], len(same)], strict=True):
+        if end - begin < 2:
+            continue
+        if end < len(same):
+            moved_m = float(np.linalg.norm(position_m[end] - position_m[begin]))
+            held[begin + 1 : end] = moved_m > 0.5 * HARDEST_MPS2 * (time_s[end] - time_s[end - 1]) ** 2
+        elif time_s[begin] - time_s[0] >= BRAKING_S:
+            earlier = int(np.searchsorted(time_s, time_s[begin] - BRAKING_S, side="right")) - 1
+            way_m = float(np.linalg.norm(position_m[begin] - position_m[earlier]))
+            noise_m = HELD_SIGMAS * float(np.linalg.norm([sigma_m[earlier], sigma_m[begin]]))
+            held[begin + 1 :] = way_m > 0.5 * HARDEST_MPS2 * (time_s[begin] - time_s[earlier]) ** 2 + noise_m
+    return held
 
 
 def _line_at(dt: Floats, position: Floats) -> Floats:

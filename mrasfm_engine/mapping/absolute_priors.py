@@ -87,11 +87,11 @@ class AbsolutePriors:
         """True where the receiver's positions take no part, for the reason that the placement has."""
         return self.placement is not None and self.placement.prior is None
 
-    def place(self, mapper: Mapper, *, sigma_scale: float = 0.0) -> None:
+    def place(self, mapper: Mapper, *, sigma_scale: float = 0.0, rig_may_be_wrong: bool = False) -> None:
         """Move the scene to where positions, or else rough poses, say that it is; both become terms.
 
         What they say of its scale is compared with the rig as given: positions may have changed it while it grew.
-        `sigma_scale`, relative, is what the images leave open of it.
+        `sigma_scale`, relative, is what the images leave open of it. See `place_by_gnss` for `rig_may_be_wrong`.
         """
         settings = mapper.config.bundle_adjustment
         self.placed_by_rough_poses = False
@@ -99,7 +99,12 @@ class AbsolutePriors:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
         if self.gnss is not None and self.antenna_in_rig_m is not None:
             self.placement = place_by_gnss(
-                mapper, self.gnss, self.antenna_in_rig_m, sigma_scale=sigma_scale, thorough=True
+                mapper,
+                self.gnss,
+                self.antenna_in_rig_m,
+                sigma_scale=sigma_scale,
+                rig_may_be_wrong=rig_may_be_wrong,
+                thorough=True,
             )
         sigma = mapper.drive.manifest.rough_poses
         if self.positions is None and self.rough_world_from_rig is not None and sigma is not None:

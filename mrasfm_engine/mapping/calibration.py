@@ -111,15 +111,22 @@ def median_depth_m(mapper: Mapper) -> float:
 
 
 def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
-    """Factor by which the baselines would have to grow to be as given, and its standard deviation by their prior."""
+    """Factor by which the baselines would have to grow to be as given, and its standard deviation by their prior.
+
+    A camera that is not where it was given counts as little as its prior lets it.
+    """
     prior = calibration_prior(mapper)
     given, current = _about_their_mean(prior.position_m), _about_their_mean(mapper.state.camera_position_m)
-    lengths_m = np.linalg.norm(current), np.linalg.norm(given)
-    if min(lengths_m) ** 2 < MIN_BASELINES_M2:
+    if min(np.linalg.norm(current), np.linalg.norm(given)) ** 2 < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
     information = ((given**2).sum(1) / prior.sigma_translation_m**2).sum()
+    weights = prior.own_weights(mapper.state)
     # Lengths alone: the images may have turned the baselines, and no turn shrinks or mirrors a scene.
-    return float(lengths_m[1] / lengths_m[0]), float(1.0 / np.sqrt(information))
+    lengths_m = [
+        float(np.sqrt(weights @ ((position_m - np.average(position_m, axis=0, weights=weights)) ** 2).sum(axis=1)))
+        for position_m in (mapper.state.camera_position_m, prior.position_m)
+    ]
+    return lengths_m[1] / lengths_m[0], float(1.0 / np.sqrt(information))
 
 
 def scale_with_baselines(mapper: Mapper, factor: float) -> None:

@@ -54,6 +54,17 @@ class GnssAlignment:
     noise_factor: float  # how much larger residuals are than the declared sigmas say, at least 1
 
 
+@dataclass(frozen=True, kw_only=True)
+class Refusal:
+    """The reason why positions do not fit the reconstruction.
+
+    `is_of_scale` is True where they have its shape at another scale, and nothing else is wrong.
+    """
+
+    reason: str
+    is_of_scale: bool = False
+
+
 def align_with_gnss(
     antenna_m: Floats,
     up: Floats,
@@ -65,7 +76,7 @@ def align_with_gnss(
     sigma_rig_scale: float,
     may_bend: bool = True,
     rng: np.random.Generator,
-) -> GnssAlignment | str:
+) -> GnssAlignment | Refusal:
     """Rigid transform from the reconstruction's frame to the receiver's.
 
     The reconstruction may be bent, as it may have been made with a calibration that only the receiver corrects. Its
@@ -90,18 +101,20 @@ def align_with_gnss(
 
     Returns
     -------
-    GnssAlignment or str
-        The reason, where it is not possible.
+    GnssAlignment or Refusal
+        With the reason, where it is not possible.
     """
     if len(antenna_m) < 3:
-        return f"only {len(antenna_m)} registered units have a position at their time, 3 are needed"
-    level = se3.transform(rotation_between(np.array([0.0, 0.0, 1.0]), _unit(up.sum(0))), np.zeros(3))
+        return Refusal(reason=f"only {len(antenna_m)} registered units have a position at their time, 3 are needed")
+    level = _levelling(up)
     a = se3.apply(level, antenna_m)
     spread = np.linalg.norm(a[:, :2] - np.median(a[:, :2], axis=0), axis=1)
     if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
-        return f"the car moved by {2 * spread.max():.1f} m, too little against the receiver's noise to tell directions"
-    most = max(LEAST_SCALE_RANGE, float(np.exp(min(SCALE_SIGMAS * sigma_rig_scale, 1.0))))
-    scale_range = (1.0 / most, most)
+        moved_m = 2 * float(spread.max())
+        return Refusal(
+            reason=f"the car moved by {moved_m:.1f} m, too little against the receiver's noise to tell directions"
+        )
+    scale_range = _scale_range(sigma_rig_scale)
     start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
     if may_bend and inlier.mean() < MOST:
         bent = _bent(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)
@@ -115,10 +128,12 @@ def align_with_gnss(
         off_m = _apply(similarity, antenna_m) - measured_m
         inlier, factor = assess_residuals(off_m, sigma_m, inlier, outlier_sigmas=outlier_sigmas)
         if inlier.sum() < 3:
-            return "no consistent set of positions was found"
+            return Refusal(reason="no consistent set of positions was found")
     off_median_m = float(np.median(np.linalg.norm(off_m[:, :2], axis=1)))
     if factor > BENT and _mirrored(a, measured_m, sigma_m, outlier_sigmas, rng, off_median_m):
-        return "the trajectory has the shape of the positions' mirror image: latitude and longitude are swapped"
+        return Refusal(
+            reason="the trajectory has the shape of the positions' mirror image: latitude and longitude are swapped"
+        )
     scale = float(np.cbrt(np.linalg.det(similarity[:3, :3])))
     rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
     centre = np.average(antenna_m[inlier], axis=0, weights=weight)
@@ -134,6 +149,42 @@ def align_with_gnss(
         sigma_scale=float(sigma_scale),
         noise_factor=factor,
     )
+
+
+def has_shape(
+    antenna_m: Floats,
+    up: Floats,
+    measured_m: Floats,
+    sigma_m: Floats,
+    *,
+    outlier_sigmas: float,
+    sigma_rig_scale: float,
+    rng: np.random.Generator,
+) -> bool:
+    """Return whether most positions have the reconstruction's shape at the rig's scale, but for the least of `BENDS`.
+
+    The parameters are those of `align_with_gnss`.
+    """
+    a = se3.apply(_levelling(up), antenna_m)
+    sigma_m = np.hypot(sigma_m, BENDS[0] * _extent_m(a))
+    _, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, _scale_range(sigma_rig_scale))
+    return bool(inlier.mean() >= MOST)
+
+
+def _levelling(up: Floats) -> Floats:
+    """The turn (4, 4) that makes the mean of up directions (n, 3) vertical."""
+    return se3.transform(rotation_between(np.array([0.0, 0.0, 1.0]), _unit(up.sum(0))), np.zeros(3))
+
+
+def _scale_range(sigma_rig_scale: float) -> tuple[float, float]:
+    """Factors on the reconstruction that what is known of the rig's baselines allows."""
+    most = max(LEAST_SCALE_RANGE, float(np.exp(min(SCALE_SIGMAS * sigma_rig_scale, 1.0))))
+    return 1.0 / most, most
+
+
+def _extent_m(a: Floats) -> float:
+    """Root mean square of the horizontal distances of places (n, 3) from their median."""
+    return float(np.sqrt(((a[:, :2] - np.median(a[:, :2], axis=0)) ** 2).sum(1).mean()))
 
 
 def assess_residuals(off_m: Floats, sigma_m: Floats, inlier: Bools, *, outlier_sigmas: float) -> tuple[Bools, float]:
@@ -168,7 +219,7 @@ def _bent(
     None where there is none, or where the positions' mirror image, of no rigid motion, agrees clearly better. Along a
     straight line it agrees just as well.
     """
-    extent_m = float(np.sqrt(((a[:, :2] - np.median(a[:, :2], axis=0)) ** 2).sum(1).mean()))
+    extent_m = _extent_m(a)
     for bend in BENDS:
         wide_m = np.hypot(sigma, bend * extent_m)
         start, inlier = _best_yaw(a, measured, wide_m, outlier_sigmas, rng, scale_range)
@@ -196,10 +247,11 @@ def _median_residual_m(similarity: Floats, a: Floats, measured: Floats) -> float
     return float(np.median(np.linalg.norm((_apply(similarity, a) - measured)[:, :2], axis=1)))
 
 
-def _scale_is_off(scale: float) -> str:
-    return (
-        f"the receiver's trajectory is {scale:.3g} times as long as the rig's (are latitude and longitude swapped, or "
-        "are the baselines not in metres?)"
+def _scale_is_off(scale: float) -> Refusal:
+    return Refusal(
+        reason=f"the receiver's trajectory is {scale:.3g} times as long as the rig's (are latitude and longitude "
+        "swapped, or are the baselines not in metres?)",
+        is_of_scale=True,
     )
 
 
@@ -211,15 +263,15 @@ def _why_not(
     outlier_sigmas: float,
     rng: np.random.Generator,
     scale_range: tuple[float, float],
-) -> str:
+) -> Refusal:
     """Reason for which positions do not fit: perhaps only the rig's units."""
     wide, fitting = _best_yaw(a, measured, sigma, outlier_sigmas, rng, ANY_SCALE)
     scale = float(np.cbrt(np.linalg.det(wide[:3, :3])))
     if fitting.mean() >= 2 * MIN_CONSENSUS and not scale_range[0] <= scale <= scale_range[1]:
         return _scale_is_off(scale)
-    return (
-        f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the trajectory (are latitude and "
-        "longitude swapped, or the receiver's clock off?)"
+    return Refusal(
+        reason=f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the trajectory (are latitude "
+        "and longitude swapped, or the receiver's clock off?)"
     )
 
 

@@ -28,6 +28,9 @@ from schemas.findings import Finding, warning
 # At two sigmas of more a lane of 3.5 m is a third of a metre wider or narrower, and is taken for another kind of lane.
 MAX_SIGMA_SCALE = 0.05
 
+# What covers a camera for as long is no lorry beside the vehicle.
+MOST_IMAGES, MIN_UNITS_AGAINST = 0.75, 5
+
 DIRECTIONS = tuple(f"{kind} {axis}" for kind in ("rotation", "translation") for axis in "xyz")
 
 
@@ -100,6 +103,23 @@ def _covered(mapper: Mapper, log: MappingLog) -> list[dict[str, Any]]:
     ]
 
 
+def covered_camera_findings(mapper: Mapper, log: MappingLog) -> list[Finding]:
+    """Findings on cameras most of whose images contradict the poses of their units, all along the drive."""
+    names = [camera.name for camera in mapper.drive.cameras]
+    camera_of = np.array([image.camera for image in mapper.drive.images], dtype=np.int64)
+    posed = np.bincount(camera_of[mapper.registered[mapper.image_unit]], minlength=len(names))
+    covered = np.bincount(camera_of[sorted(log.covered_images)], minlength=len(names))
+    return [
+        warning(
+            "camera-against-rig",
+            f"{covered[c]} of {posed[c]} images of camera {names[c]} contradict the poses of the vehicle",
+            "They have no part in the scene. Look at them: something may cover them, they may be another camera's, or "
+            "rig_from_cam may be.",
+        )
+        for c in np.flatnonzero((posed >= MIN_UNITS_AGAINST) & (covered > MOST_IMAGES * posed)).tolist()
+    ]
+
+
 def _focal_lengths(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
     """Focal lengths of the cameras whose intrinsics varied; nothing where none did."""
     if not refinement.intrinsics_vary or refinement.intrinsics is None:
@@ -158,7 +178,8 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "noise_factor": placement.noise_factor,
             "errors_in_declared_sigmas": {"white": placement.errors.white, "wander": placement.errors.wander},
             "wandering_error_rms_m": _wandering_rms_m(mapper, placement),
-            "scale_of_rig_against_gnss": alignment.scale,
+            "scale_of_rig_against_gnss": placement.scale_of_rig,
+            "error_jumps_at_us": [int(t) for t in mapper.drive.timestamps_us[placement.jumps]],
         }
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}

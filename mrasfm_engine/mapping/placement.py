@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize
 
 from mrasfm_engine.bundle_adjustment.priors import RotationPrior
-from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions, time_of_process_s
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.gnss_track import GnssTrack
@@ -21,13 +21,16 @@ from mrasfm_engine.mapping.georeferencing import (
     BENT,
     MOST,
     GnssAlignment,
+    Refusal,
     align_with_gnss,
     assess_residuals,
     clock_offset,
+    has_shape,
     rigid_motions,
     similarity_motions,
 )
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.receiver_jumps import AROUND, find_jumps, segment_of
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.findings import Finding, warning
 
@@ -39,6 +42,7 @@ MIN_ROUGH_POSES = 2
 MIN_POSITIONS = 3
 MIN_WHITE = 0.01  # of the declared sigma: of a receiver that filters, positions scatter by nothing that shows
 STEADY = 1.5
+MAX_BETWEEN_UNITS = 3.0  # usual times between units, across which the antenna's way is a straight line
 KNOTS = 20  # in the correlation time of what wanders: less often than its filter lets a receiver change its mind
 USUAL_LOG_SIGMA = np.log(2.0)  # standard deviation of the logarithm of a receiver's errors over what it declares
 MOST_RESIDUALS, MIN_FOR_LIKELIHOOD = 150, 8
@@ -73,13 +77,32 @@ class ReceiverErrors:
         return bool((np.abs(np.log(sizes[0] / sizes[1])) < np.log(STEADY)).all())
 
 
+@dataclass(frozen=True, kw_only=True)
+class Samples:
+    """A receiver's positions as it gave them, ascending in time."""
+
+    time_s: Floats  # (m,)
+    position_m: Floats  # (m, 3)
+    sigma_m: Floats  # (m, 3)
+
+    @staticmethod
+    def of_track(track: GnssTrack) -> Samples:
+        """The track's samples but for gross errors."""
+        good = track.good
+        return Samples(
+            time_s=track.timestamps_us[good] / 1e6, position_m=track.position_m[good], sigma_m=track.sigma_m[good]
+        )
+
+
 @dataclass(kw_only=True)
 class Placement:
     """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, for the reason given."""
 
     prior: ReceiverPositions | None = None
     reason: str = ""
+    is_of_another_scale: bool = False  # which is all that the positions contradict
     alignment: GnssAlignment | None = None
+    scale_of_rig: float = 1.0  # factor on the rig's lengths as given that makes the scene fit positions best
     known_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (u, 3) positions, NaN where there is none
     known_sigma_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (u, 3)
     lever_arm_m: Floats = field(default_factory=lambda: np.zeros(3))
@@ -87,24 +110,43 @@ class Placement:
     inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
     off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
     interval_us: float = 0.0  # of the receiver's samples
+    samples: Samples | None = None  # of the receiver, where its error may jump
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
+    jumps: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (k,) units from which on it is another
+    blended: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # units between two samples of a jump
+    level_m: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # (k + 1, 3) what each part adds to positions
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
 
     @property
     def is_contradicted(self) -> bool:
         """True where the scene does not have the shape of most positions."""
-        return self.prior is not None and bool(self.noise_factor > BENT or self.inlier.mean() < MOST)
+        if self.prior is None:
+            return False
+        return bool(self.noise_factor > BENT or self.inlier[~np.isin(self.units, self.blended)].mean() < MOST)
 
 
 def place_by_gnss(
-    mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats, *, sigma_scale: float = 0.0, thorough: bool = False
+    mapper: Mapper,
+    gnss: GnssTrack,
+    antenna_in_rig_m: Floats,
+    *,
+    sigma_scale: float = 0.0,
+    rig_may_be_wrong: bool = False,
+    thorough: bool = False,
 ) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
     The reconstruction keeps its scale, which comes from the rig; that of a single camera is the receiver's, and that of
-    a scene whose images hardly compare it with the rig. `sigma_scale`, relative, is by how much it may be off beside
-    what the baselines are. See `reassess_positions` for `thorough`.
+    a scene whose images hardly compare it with the rig. See `reassess_positions` for `thorough`.
+
+    Parameters
+    ----------
+    sigma_scale
+        By how much the scale may be off beside what the baselines are, relative.
+    rig_may_be_wrong
+        Whether baselines may be wrong beyond what is known of them, by any factor: positions that have the scene's
+        shape then give their scale to the scene and to the baselines, unless swapped ones would explain it.
     """
     settings, times = mapper.config.gnss, mapper.drive.timestamps_us
     measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
@@ -112,16 +154,25 @@ def place_by_gnss(
     single = mapper.drive.has_single_camera
     sigma_rig_scale = float(np.hypot(scale_of_baselines(mapper)[1], sigma_scale))
 
-    def align() -> GnssAlignment | str:
-        return _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
+    def align() -> GnssAlignment | Refusal:
+        found = _align(mapper, units, antenna_in_rig_m, measured, sigma, sigma_rig_scale)
+        if rig_may_be_wrong and isinstance(found, GnssAlignment) and found.sigma_scale > UNKNOWN_SIGMA_SCALE:
+            return Refusal(reason="the receiver's trajectory contradicts the rig's length, and hardly knows its own")
+        return found
 
-    if (single or sigma_scale > UNKNOWN_SIGMA_SCALE) and len(units) > 1:
+    takes_scale = single or rig_may_be_wrong or sigma_scale > UNKNOWN_SIGMA_SCALE
+    if rig_may_be_wrong and _fits_swapped(mapper, units, gnss, antenna_in_rig_m, measured, sigma, sigma_rig_scale):
+        return Placement(
+            reason="with latitude and longitude swapped the receiver's trajectory has the rig's length, as given not"
+        )
+    if takes_scale and len(units) > 1:
         factor = _extent(measured[units]) / _extent(mapper.state.unit_position_m[units])
-        alignment = _with_receivers_scale(mapper, align, factor)
+        scale = scale_with_baselines if single or rig_may_be_wrong else scale_scene
+        alignment = _with_receivers_scale(mapper, align, factor, scale)
     else:
         alignment = align()
-    if isinstance(alignment, str):
-        return Placement(reason=alignment)
+    if isinstance(alignment, Refusal):
+        return Placement(reason=alignment.reason, is_of_another_scale=alignment.is_of_scale)
     move(mapper, alignment.world_from_model)
     placement = Placement(
         alignment=alignment,
@@ -133,27 +184,30 @@ def place_by_gnss(
         off_m=_antenna_m(mapper, units, antenna_in_rig_m) - measured[units],
         interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
         noise_factor=alignment.noise_factor,
+        samples=Samples.of_track(gnss),
     )
     placement = _with_prior(mapper, placement, thorough=thorough)
     if not single:
-        assert placement.prior is not None
-        placement.findings = _findings(mapper, alignment, placement.prior)
+        placement = replace(placement, scale_of_rig=_scale_by_positions(mapper, placement))
+        placement.findings = _findings(mapper, placement)
     return placement
 
 
 def _with_receivers_scale(
-    mapper: Mapper, align: Callable[[], GnssAlignment | str], factor: float
-) -> GnssAlignment | str:
+    mapper: Mapper,
+    align: Callable[[], GnssAlignment | Refusal],
+    factor: float,
+    scale: Callable[[Mapper, float], None],
+) -> GnssAlignment | Refusal:
     """Scale the scene to the receiver, beginning with a factor, and align it; it stays as it is if that fails."""
     begun = copy.deepcopy(mapper.state)
-    scale = scale_with_baselines if mapper.drive.has_single_camera else scale_scene
     scale(mapper, factor)
     alignment = align()
     for _ in range(SCALE_ROUNDS):
         if isinstance(alignment, GnssAlignment):
             scale(mapper, alignment.scale)
             factor, alignment = factor * alignment.scale, align()
-    if isinstance(alignment, str):
+    if isinstance(alignment, Refusal):
         scale(mapper, 1.0 / factor)  # also poses of single images, which are no part of the state,
         mapper.state = begun  # and without what that rounds
     return alignment
@@ -216,15 +270,17 @@ def positions_of_units(mapper: Mapper, placement: Placement, units: Ints) -> Rec
 def _as_term(mapper: Mapper, placement: Placement, units: Ints, errors: ReceiverErrors) -> ReceiverPositions:
     """Positions of some units with errors of a certain size."""
     sigma_m, settings = placement.known_sigma_m[units], mapper.config.gnss
+    segment = segment_of(units, placement.jumps)
     return ReceiverPositions.from_samples(
         unit=units,
         time_s=mapper.drive.timestamps_us[units] / 1e6,
-        position_m=placement.known_m[units],
+        position_m=placement.known_m[units] + placement.level_m[segment],
         white_m=sigma_m * errors.white * np.sqrt(errors.positions_a_sample),
         wander_m=sigma_m * errors.wander,
         lever_arm_m=placement.lever_arm_m,
         wander_time_s=settings.wander_time_s,
         least_spacing_s=max(settings.correlation_time_s, settings.wander_time_s / KNOTS),
+        segment=segment,
     )
 
 
@@ -232,11 +288,90 @@ def _with_prior(
     mapper: Mapper, placement: Placement, *, thorough: bool = False, clock_varies: bool = False
 ) -> Placement:
     """The placement with its positions that are no outliers as a term of the adjustment."""
+    placement = _with_jumps(mapper, placement)
     if thorough:
         placement = replace(placement, errors=most_likely_errors(mapper, placement, clock_varies=clock_varies))
     else:
         placement = replace(placement, errors=receiver_errors(mapper, placement))
     return replace(placement, prior=positions_of_units(mapper, placement, placement.units[placement.inlier]))
+
+
+def _with_jumps(mapper: Mapper, placement: Placement) -> Placement:
+    """The placement with the units at which the receiver's error jumps, and positions judged by how they lie to those
+    of their own part.
+
+    Outliers take part, as all positions behind a jump may be. What is interpolated across a jump is one. Parts lie to
+    the largest one as the scene shows: of how far an error jumps no receiver says anything, and what is left of it is
+    judged again when the scene has been adjusted.
+    """
+    none = np.zeros(0, dtype=np.int64)
+    placement = replace(placement, jumps=none, blended=none, level_m=np.zeros((1, 3)))
+    if placement.samples is None or len(placement.units) < MIN_POSITIONS:
+        return placement
+    times_s = mapper.drive.timestamps_us[placement.units] / 1e6
+    before_s, after_s = _jump_times_s(mapper, placement, times_s)
+    if not len(after_s):
+        return placement
+    between = (times_s[:, None] > before_s) & (times_s[:, None] < after_s)
+    blended = np.asarray(between.any(axis=1), dtype=np.bool_)
+    segment = np.searchsorted(after_s, times_s, side="right")
+    parts = np.unique(segment)
+    level_m = np.zeros((len(after_s) + 1, 3))
+    for part in parts:
+        level_m[part] = np.median(placement.off_m[segment == part], axis=0)
+    # The scene may lie between them: an adjustment moves it to the largest one, as a whole.
+    inlier, factor = assess_residuals(
+        placement.off_m - level_m[segment],
+        placement.known_sigma_m[placement.units],
+        ~blended,
+        outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+    )
+    inlier &= ~blended
+    if len(parts) < 2 or inlier.sum() < MIN_POSITIONS:
+        return placement
+    return replace(
+        placement,
+        inlier=inlier,
+        noise_factor=factor,
+        # A part without a unit begins where the next one does.
+        jumps=np.append(placement.units, placement.units[-1] + 1)[np.searchsorted(times_s, after_s)],
+        blended=placement.units[blended],
+        level_m=level_m - level_m[np.bincount(segment).argmax()],
+    )
+
+
+def _jump_times_s(mapper: Mapper, placement: Placement, times_s: Floats) -> tuple[Floats, Floats]:
+    """Times (k,) of the last samples before jumps of the receiver's error, and of the first ones after them.
+
+    A sample is compared with the scene at its own time: positions that are interpolated have no steps. Of samples that
+    come more often than units, those nearest to units take part.
+    """
+    samples = placement.samples
+    assert samples is not None
+    unit_s = float(np.median(np.diff(times_s)))
+    among = (samples.time_s >= times_s[0]) & (samples.time_s <= times_s[-1])
+    if placement.interval_us / 1e6 < 0.75 * unit_s:
+        among &= np.isin(np.arange(len(among)), np.abs(samples.time_s - times_s[:, None]).argmin(axis=1))
+    rows = np.flatnonzero(among)
+    # Where no unit is near, the scene says nothing of where the antenna was.
+    after = np.clip(np.searchsorted(times_s, samples.time_s[rows]), 1, len(times_s) - 1)
+    rows = rows[times_s[after] - times_s[after - 1] <= MAX_BETWEEN_UNITS * unit_s]
+    at_s, antenna_m = samples.time_s[rows], _antenna_m(mapper, placement.units, placement.lever_arm_m)
+    there_m = np.stack([np.interp(at_s, times_s, antenna_m[:, axis]) for axis in range(3)], axis=1)
+    first = find_jumps(
+        there_m - samples.position_m[rows],
+        samples.sigma_m[rows],
+        at_s,
+        wander_time_s=mapper.config.gnss.wander_time_s,
+    )
+    return at_s[first - 1], at_s[first]
+
+
+def _positions_a_sample(placement: Placement, times_s: Floats) -> int:
+    """Number of units whose positions are interpolated between the same two samples."""
+    if len(times_s) < MIN_POSITIONS:
+        return 1
+    return max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
 
 
 def _antenna_m(mapper: Mapper, units: Ints, lever_arm_m: Floats) -> Floats:
@@ -247,7 +382,7 @@ def _antenna_m(mapper: Mapper, units: Ints, lever_arm_m: Floats) -> Floats:
 
 def _align(
     mapper: Mapper, units: Ints, antenna_in_rig_m: Floats, measured: Floats, sigma: Floats, sigma_rig_scale: float
-) -> GnssAlignment | str:
+) -> GnssAlignment | Refusal:
     rotation = mapper.state.unit_rotation[units]
     return align_with_gnss(
         mapper.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
@@ -258,6 +393,30 @@ def _align(
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,
         sigma_rig_scale=sigma_rig_scale,
         may_bend=mapper.config.bundle_adjustment.reassessment,
+        rng=np.random.default_rng(mapper.config.seed),
+    )
+
+
+def _fits_swapped(
+    mapper: Mapper,
+    units: Ints,
+    gnss: GnssTrack,
+    antenna_in_rig_m: Floats,
+    measured: Floats,
+    sigma: Floats,
+    sigma_rig_scale: float,
+) -> bool:
+    """True where positions with latitude and longitude swapped have the trajectory's shape at the rig's scale."""
+    if gnss.swapped_from_local is None:
+        return False
+    rotation = mapper.state.unit_rotation[units]
+    return has_shape(
+        mapper.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+        rotation[:, :, 2],
+        measured[units] @ gnss.swapped_from_local.T,
+        sigma[units],
+        outlier_sigmas=mapper.config.gnss.outlier_sigmas,
+        sigma_rig_scale=sigma_rig_scale,
         rng=np.random.default_rng(mapper.config.seed),
     )
 
@@ -348,7 +507,7 @@ def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
     if len(times_s) < MIN_POSITIONS:
         return ReceiverErrors(white=MIN_WHITE, wander=placement.noise_factor)
     # Positions between two samples are a blend of both.
-    apart = max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
+    apart = _positions_a_sample(placement, times_s)
     sigma_m = placement.known_sigma_m[placement.units[good]] * placement.noise_factor
     whitened = placement.off_m[good] / sigma_m
     steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
@@ -380,7 +539,10 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
         return begin  # what scatters by as much as is declared leaves nothing that wanders
     units, off_m = placement.units[good], placement.off_m[good]
     place_m = _antenna_m(mapper, units, placement.lever_arm_m)
-    ways = [similarity_motions(place_m)]
+    segment, wander_time_s = segment_of(units, placement.jumps), mapper.config.gnss.wander_time_s
+    # The size of a jump says nothing of what scatters and wanders.
+    behind = segment[:, None] > np.arange(len(placement.jumps))
+    ways = [similarity_motions(place_m), *(part[:, None, None] * np.eye(3) for part in behind.T)]
     if clock_varies:
         ways.append(mapper.motion.velocity_mps(mapper.state, mapper.registered)[units][:, :, None])
     # Along a straight line they are fewer.
@@ -394,8 +556,9 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
         wander_m=sigma_m,
         lever_arm_m=placement.lever_arm_m,
         time_s=time_s,
-        knots_s=time_s,
-        wander_time_s=mapper.config.gnss.wander_time_s,
+        knots_s=time_of_process_s(time_s, segment, wander_time_s),
+        wander_time_s=wander_time_s,
+        segment=segment,
     )
     least, most = np.log([MIN_WHITE, MIN_WHITE]), np.log([np.inf, placement.noise_factor])
 
@@ -429,12 +592,59 @@ def _among_neighbours(residuals: Floats, outlier_sigmas: float) -> Bools:
     return result
 
 
-def _findings(mapper: Mapper, alignment: GnssAlignment, positions: ReceiverPositions) -> list[Finding]:
+def jump_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
+    """The finding that the receiver's error jumps, with where it does so most."""
+    if not len(placement.jumps):
+        return []
+    good = np.flatnonzero(placement.inlier)
+    at = np.searchsorted(placement.units[good], placement.jumps)
+    off_m = placement.off_m[good]
+    sizes_m = [_step_m(off_m, k) for k in at.tolist()]
+    largest = int(np.argmax(sizes_m))
+    times_us = mapper.drive.timestamps_us[placement.jumps]
+    return [
+        warning(
+            "gnss-error-jumps",
+            f"positions of the receiver jump by about {sizes_m[largest]:.1f} m at {times_us[largest]} us and stay there"
+            + (f"; there are {len(times_us)} such places" if len(times_us) > 1 else ""),
+            "Nothing needs to be done: errors before and after it are taken as independent. Receivers that lose their "
+            "fix do this; where the scene lies is less certain.",
+        )
+    ]
+
+
+def _step_m(off_m: Floats, k: int) -> float:
+    """Distance between the residuals (n, 3) before sample k and those from it on."""
+    before, after = off_m[max(0, k - AROUND) : k], off_m[k : k + AROUND]
+    return float(np.linalg.norm(np.median(after, axis=0) - np.median(before, axis=0))) if 0 < k < len(off_m) else 0.0
+
+
+def _scale_by_positions(mapper: Mapper, placement: Placement) -> float:
+    """Factor on the lengths of the rig as given by which the scene fits positions best.
+
+    Where the receiver's error jumps, an alignment of all positions does not tell it: the term does. Baselines may have
+    taken the receiver's scale already.
+    """
+    alignment, positions = placement.alignment, placement.prior
+    assert alignment is not None
+    assert positions is not None
+    if not len(placement.jumps):
+        return alignment.scale / scale_of_baselines(mapper)[0]
+    antenna_m = _antenna_m(mapper, positions.unit, positions.lever_arm_m)
+    off_m = (positions.position_m - antenna_m)[:, :, None]
+    known = positions.information(np.concatenate([similarity_motions(antenna_m), off_m], axis=2))
+    growth = np.linalg.lstsq(known[:-1, :-1], known[:-1, -1], rcond=1e-12)[0][-1]
+    return float((1.0 + growth) / scale_of_baselines(mapper)[0])
+
+
+def _findings(mapper: Mapper, placement: Placement) -> list[Finding]:
     """A receiver's clock that is clearly off the images', and a rig whose scale the receiver contradicts."""
-    findings = []
+    findings, positions = [], placement.prior
+    assert positions is not None
     antenna_m = _antenna_m(mapper, positions.unit, positions.lever_arm_m)
     centred_m = antenna_m - antenna_m.mean(0)
-    offset = clock_offset(antenna_m.mean(0) + alignment.scale * centred_m, positions)
+    scale = placement.scale_of_rig * scale_of_baselines(mapper)[0]
+    offset = clock_offset(antenna_m.mean(0) + scale * centred_m, positions)
     if offset is not None and abs(offset[0]) > max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
         direction = "ahead of" if offset[0] > 0 else "behind"
         findings.append(
@@ -448,12 +658,12 @@ def _findings(mapper: Mapper, alignment: GnssAlignment, positions: ReceiverPosit
     _, sigma_rig = scale_of_baselines(mapper)
     known = positions.information_given(centred_m, rigid_motions(centred_m))
     sigma = 1.0 / np.sqrt(max(known, 1e-12))
-    if abs(alignment.scale - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
+    if abs(placement.scale_of_rig - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
         findings.append(
             warning(
                 "scale-disagreement",
-                f"GNSS makes the way {alignment.scale:.3f} times as long as the rig as given does, whose baselines are "
-                f"taken to be known to {sigma_rig:.1%}",
+                f"GNSS makes the way {placement.scale_of_rig:.3g} times as long as the rig as given does, whose "
+                f"baselines are taken to be known to {sigma_rig:.1%}",
                 "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
                 "swapped?). Declare sigma_translation_m of the cameras.",
             )

@@ -79,7 +79,7 @@ def require_calibration_direction(
         for cb in range(ca + 1, len(drive.cameras)):
             if (u, cb) in where and (found := verified(a, where[u, cb])) is not None:
                 gate = PAIR_ERROR_PX / float(params[[ca, cb], 0].min())
-                by_depth.append([_explained(rig[ca], rig[cb], *found, gate) for rig in rigs])
+                by_depth.append([share_explained(rig[ca], rig[cb], *found, gate) for rig in rigs])
     for evidence in (by_motion, by_depth):
         if len(evidence) >= MIN_EVIDENCE:
             given_ok, *inverse = np.median(np.array(evidence), axis=0)
@@ -89,7 +89,7 @@ def require_calibration_direction(
                     "rig.cameras: rig_from_cam looks like its inverse, cam_from_rig: the first units agree "
                     f"{inverse_ok:.0%} with the inverse and {given_ok:.0%} with what is given",
                     remedy="Give the camera's pose in the rig: its translation is where the camera sits on the "
-                    "vehicle.",
+                    "vehicle. Check as well that no two cameras' images are swapped.",
                     code="calibration-inverted",
                 )
 
@@ -123,8 +123,11 @@ def _inverses(rig_from_cam: Floats) -> list[Floats]:
     return [flu @ se3.inverse(se3.inverse(flu) @ rig_from_cam) for flu in map(flu_from_body, BodyAxes)]
 
 
-def _explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> float:
-    """Share of matches near their epipolar lines and in front of both cameras."""
+def share_explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> float:
+    """Share of matches whose rays (n, 3) lie within `gate` (rad) of their epipolar planes and meet before both cameras.
+
+    The cameras' poses in the rig are (4, 4).
+    """
     b_from_a = se3.inverse(rig_from_b) @ rig_from_a
     near = epipolar_errors(b_from_a, rays_a, rays_b) < gate
     return float((near & in_front_of_both(b_from_a, rays_a, rays_b)).mean())

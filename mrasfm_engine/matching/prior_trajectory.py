@@ -9,13 +9,14 @@ import numpy as np
 from mrasfm_engine.config import GnssConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import geodesy, se3
-from mrasfm_engine.geometry.gnss_track import GnssTrack, RoughTrajectory, find_gross_errors, rough_trajectory
+from mrasfm_engine.geometry.gnss_track import GnssTrack, RoughTrajectory, find_gross_errors, find_held, rough_trajectory
 from mrasfm_engine.io.heights import ellipsoidal_heights
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose
 from mrasfm_engine.scene.scene import Georeference
 from mrasfm_engine.types import Floats
 
 SLACK_US = 100_000  # by which units may lie before or after the poses
+POLE_DEG = 89.0  # beyond it, degrees of longitude are too short to tell anything
 MARGIN_US = 10_000_000  # of samples before and after the drive that are looked at
 
 
@@ -88,9 +89,17 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
     position = geodesy.local_from_geodetic(geodetic, ecef_from_local)
     sigma = np.array([(s.sigma_horizontal_m, s.sigma_horizontal_m, s.sigma_vertical_m) for s in gnss.samples])
     times = np.array([s.timestamp_us for s in gnss.samples], dtype=np.int64)
-    bad = find_gross_errors(times, position, sigma, outlier_sigmas=config.outlier_sigmas)
+    good = ~find_held(times, position, sigma)
+    bad = find_gross_errors(times[good], position[good], sigma[good], outlier_sigmas=config.outlier_sigmas)
+    good[good] = ~bad
     return (
-        GnssTrack(timestamps_us=times, position_m=position, sigma_m=sigma, good=~bad),
+        GnssTrack(
+            timestamps_us=times,
+            position_m=position,
+            sigma_m=sigma,
+            good=good,
+            swapped_from_local=_swapped_from_local(float(origin[0]), float(origin[1])),
+        ),
         Georeference(
             origin_latitude_deg=float(origin[0]),
             origin_longitude_deg=float(origin[1]),
@@ -99,6 +108,14 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
             ecef_from_local=ecef_from_local,
         ),
     )
+
+
+def _swapped_from_local(latitude_deg: float, longitude_deg: float) -> Floats | None:
+    """The map (3, 3) of directions from a place to the one that has its coordinates swapped, on a sphere."""
+    if abs(longitude_deg) >= POLE_DEG or abs(latitude_deg) >= POLE_DEG:
+        return None
+    from_north, from_east = np.cos(np.radians(longitude_deg)), 1.0 / np.cos(np.radians(latitude_deg))
+    return np.array([[0.0, from_north, 0.0], [from_east, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _rough(drive: Drive) -> tuple[Floats, Floats]:

@@ -92,7 +92,13 @@ def described(parts: Sequence[Component]) -> dict[str, Any]:
     return {
         **mapping_report.describe(parts[0].mapper, parts[0].log, [part.mapper for part in parts[1:]]),
         **gaps.describe(parts),
-        "findings": [as_json(finding) for finding in gaps.findings(parts)],
+        "findings": [
+            as_json(finding)
+            for finding in [
+                *gaps.findings(parts),
+                *mapping_report.covered_camera_findings(parts[0].mapper, parts[0].log),
+            ]
+        ],
     }
 
 

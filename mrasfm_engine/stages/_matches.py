@@ -9,6 +9,7 @@ import numpy as np
 
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.io.stage_store import Arrays, StageWriter, StoredStage
+from mrasfm_engine.matching.contradicted_rig import require_images_as_listed
 from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import SearchResult, match_pairs
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -52,6 +53,16 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
             prior=known,
             further=chosen.further,
             progress=run.step(Stage.MATCHES),
+            cancel=run.cancel,
+        )
+        require_images_as_listed(
+            run.drive,
+            found,
+            result.pairs,
+            run.components.matcher,
+            run.config.matching,
+            run.config.bundle_adjustment,
+            rig_from_cam=result.rig.rig_from_cam,
             cancel=run.cancel,
         )
         write_pairs(stage, chosen.with_revisits(result.pairs))

@@ -7,7 +7,7 @@ import pytest
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.problem import Layout
-from mrasfm_engine.bundle_adjustment.receiver_positions import MAX_KNOTS, ReceiverPositions
+from mrasfm_engine.bundle_adjustment.receiver_positions import MAX_KNOTS, ReceiverPositions, time_of_process_s
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import PARAMETERS
@@ -52,9 +52,17 @@ def received(state: State, rng: np.random.Generator, **changes: object) -> Recei
     return replace(term, **changes)
 
 
+def jumping(term: ReceiverPositions, first: int) -> ReceiverPositions:
+    """The term with an error that jumps at a sample."""
+    segment = (np.arange(UNITS) >= first).astype(np.int64)
+    return replace(term, segment=segment, knots_s=time_of_process_s(term.time_s, segment, WANDER_TIME_S))
+
+
 def covariances(term: ReceiverPositions) -> list[np.ndarray]:
     """Covariance (n, n) of the errors along each axis, as it is defined."""
     alike = np.exp(-np.abs(term.time_s[:, None] - term.time_s) / WANDER_TIME_S)
+    if term.segment is not None:
+        alike = np.where(term.segment[:, None] == term.segment, alike, 0.0)
     return [
         np.diag(term.sigma_m[:, a] ** 2) + np.outer(term.wander_m[:, a], term.wander_m[:, a]) * alike for a in range(3)
     ]
@@ -71,11 +79,50 @@ def test_without_outliers_it_costs_what_correlated_errors_do() -> None:
     assert term.cost(state) < 0.3 * replace(term, wander_m=0 * term.wander_m).cost(state)
 
 
+def test_errors_before_and_after_a_jump_are_independent() -> None:
+    rng = np.random.default_rng(0)
+    state = moving(rng)
+    term = jumping(received(state, rng, loss_scale=1e6), 7)
+    off_m = state.unit_position_m + state.unit_rotation @ ARM_M - term.position_m
+    off_m[7:] -= [3.0, -2.0, 0.0]
+    expected = 0.5 * sum(off_m[:, a] @ np.linalg.solve(c, off_m[:, a]) for a, c in enumerate(covariances(term)))
+    term = replace(term, position_m=term.position_m + (np.arange(UNITS) >= 7)[:, None] * np.array([3.0, -2.0, 0.0]))
+    assert term.cost(state) == pytest.approx(expected, rel=1e-9)
+    assert term.cost(state) < 0.7 * replace(term, segment=None, knots_s=term.time_s).cost(state)
+
+
+def test_knots_of_samples_begin_anew_at_a_jump() -> None:
+    rng = np.random.default_rng(0)
+    state = moving(rng)
+    known = received(state, rng)
+    segment = (np.arange(UNITS) >= 7).astype(np.int64)
+    term = ReceiverPositions.from_samples(
+        unit=known.unit,
+        time_s=known.time_s,
+        position_m=known.position_m,
+        white_m=known.sigma_m,
+        wander_m=known.wander_m,
+        lever_arm_m=ARM_M,
+        wander_time_s=WANDER_TIME_S,
+        least_spacing_s=4.0,
+        segment=segment,
+    )
+    first = time_of_process_s(known.time_s, segment, WANDER_TIME_S)[[0, 7]]
+    # Samples every 2 s: 0 to 12 s and 14 to 22 s.
+    np.testing.assert_allclose(term.knots_s, [*(first[0] + [0, 4, 8, 12]), *(first[1] + [0, 4, 8])])
+    # Some of them, as in a local adjustment, are in the same parts.
+    some = term.of_rows(np.arange(5, 10), np.arange(5, 10), np.ones(5))
+    assert some.segment is not None
+    assert some.segment.tolist() == [0, 0, 1, 1, 1]
+
+
+@pytest.mark.parametrize("jump", [False, True])
 @pytest.mark.parametrize("fixed", [None, 4])
-def test_matrix_is_the_information_of_correlated_errors(fixed: int | None) -> None:
+def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, jump: bool) -> None:
     rng = np.random.default_rng(1)
     state, layout = moving(rng), free_units(fixed)
     term = received(state, rng, loss_scale=1e6)
+    term = jumping(term, 5) if jump else term
     extra = Extra.none(layout)
     term.add_to(state, layout, extra)
     units = np.flatnonzero(layout.unit_slot >= 0)

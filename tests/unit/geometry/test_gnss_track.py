@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.gnss_track import GnssTrack, find_gross_errors, rough_trajectory
+from mrasfm_engine.geometry.gnss_track import GnssTrack, find_gross_errors, find_held, rough_trajectory
 
 ARM_M = np.array([-0.5, 0.2, 1.8])
 
@@ -161,3 +161,43 @@ def test_gross_errors_are_left_out_of_the_rough_trajectory() -> None:
 def test_no_direction_no_rough_trajectory(count: int) -> None:
     noise = np.random.default_rng(2).normal(size=(count, 3)) * 0.02
     assert rough_trajectory(track(times_us(count), noise), times_us(count), np.zeros(3)) is None
+
+
+def held_of(position_m: np.ndarray, *, sigma_m: float = 0.5, step_s: float = 0.1) -> list[int]:
+    t = times_us(len(position_m), step_s)
+    return np.flatnonzero(find_held(t, position_m, np.full(position_m.shape, sigma_m))).tolist()
+
+
+def driven(samples: int = 40, speed_mps: float = 10.0) -> np.ndarray:
+    position_m, _ = bend(times_us(samples), speed_mps)
+    return position_m
+
+
+def test_a_position_that_is_repeated_while_the_vehicle_drives_on_is_held() -> None:
+    position_m = driven()
+    position_m[12:25] = position_m[11]
+    assert held_of(position_m) == list(range(12, 25))
+    assert held_of(driven()) == []
+
+
+@pytest.mark.parametrize("speed_mps", [1.0, 3.0, 30.0])
+def test_a_log_that_writes_each_position_of_a_slow_receiver_several_times_keeps_the_first(speed_mps: float) -> None:
+    position_m = np.repeat(driven(8, speed_mps=10.0 * speed_mps), 10, axis=0)  # of a second each
+    assert held_of(position_m, sigma_m=0.8)[:27] == [k for k in range(30) if k % 10]
+
+
+@pytest.mark.parametrize("sigma_m", [0.05, 0.3])
+def test_a_receiver_that_is_held_to_the_end_is_found_as_no_vehicle_stops_at_once(sigma_m: float) -> None:
+    position_m = driven(speed_mps=15.0)
+    position_m[30:] = position_m[29]
+    assert held_of(position_m, sigma_m=sigma_m) == list(range(30, 40))
+
+
+def test_a_vehicle_that_stands_moves_off_from_where_it_stood() -> None:
+    way_m = np.cumsum(np.concatenate([np.linspace(1.0, 0.0, 20), np.zeros(20), np.linspace(0.02, 1.0, 20)]))
+    position_m = np.stack([way_m, 0 * way_m, 0 * way_m], axis=1)
+    assert held_of(position_m) == []
+    assert held_of(position_m[:40]) == []  # and is still there at the end
+    # Once a second, it is a metre away when it is seen again.
+    way_m = np.array([*(8.0 * np.arange(5)), 38.0, *[40.0] * 20, 41.0, 44.0, 49.0, 56.0])
+    assert held_of(np.stack([way_m, 0 * way_m, 0 * way_m], axis=1), sigma_m=0.02, step_s=1.0) == []

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,11 +10,13 @@ from mrasfm_engine.bundle_adjustment.priors import RotationPrior, UprightPrior
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.geometry.alignment import align_rigid, align_similarity
+from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.absolute_priors import LOCAL_POSITIONS, AbsolutePriors
 from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.placement import jump_findings, place_by_gnss
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import RoughPose, RoughTrajectory
@@ -21,6 +24,7 @@ from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
     make_simulated_drive,
+    scaled_rig,
     true_matches,
     with_true_poses,
 )
@@ -180,19 +184,83 @@ def test_positions_that_contradict_the_scale_of_a_growing_scene_are_compared_wit
     assert 0.99 < scale < 1.01
 
 
-def test_positions_of_another_scale_than_a_stereo_pairs_stay_refused() -> None:
-    """The pair's baseline is known to 14 %, but images compare it with the scene to a tenth of a percent."""
-    simulated = stereo_drive()
+@pytest.mark.parametrize("factor", [0.305, 1.6, *slow(0.1)])
+def test_positions_of_another_scale_than_the_rigs_give_the_scene_theirs_and_say_so(factor: float) -> None:
+    """Baselines may be in feet, or a camera late by a frame; no receiver stretches a trajectory."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, given=partial(scaled_rig, scale=1.0 / factor))
+    mapper = scaled(simulated, 1.0 / factor)
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    assert result.georeferenced
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert scale == pytest.approx(1.0, rel=0.01)
+    assert result.placement is not None
+    assert "scale-disagreement" in {finding.code for finding in result.placement.findings}
+    assert result.placement.scale_of_rig == pytest.approx(factor, rel=0.1)  # the rig is turned about another place
+
+
+def test_positions_that_have_the_rigs_length_with_coordinates_swapped_are_refused() -> None:
+    """Along a straight line nothing but its length tells that latitude and longitude are swapped."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, straight=True)
     mapper = scaled(simulated, 1.0)
-    gnss = received(simulated, 0.05)
-    result = refine(
-        mapper, AbsolutePriors(gnss=replace(gnss, position_m=1.6 * gnss.position_m), antenna_in_rig_m=ARM_M)
+    right = received(simulated, 0.05)
+    # Given as 5 degrees north, 60 degrees east: at 60 degrees north, degrees of longitude are half as long.
+    swapped_from_local = np.array([[0.0, 0.5, 0.0], [1.004, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    gnss = replace(
+        right,
+        position_m=right.position_m @ np.linalg.inv(swapped_from_local).T,
+        swapped_from_local=swapped_from_local,
     )
+    result = refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
     assert not result.georeferenced
     assert result.placement is not None
-    assert "1.6 times as long" in result.placement.reason
+    assert "swapped" in result.placement.reason
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
     assert 0.9 < scale < 1.1
+
+
+@pytest.mark.parametrize("sigma_m", [0.8, *slow(0.05)])
+def test_a_receiver_whose_error_jumps_neither_scales_nor_bends_the_scene(sigma_m: float) -> None:
+    simulated = stereo_drive()
+    mapper = scaled(simulated, 1.0)
+    gnss = received(simulated, 0.02)
+    position_m = gnss.position_m + (np.arange(UNITS) >= 11)[:, None] * [2.5, -2.0, 0.0]
+    gnss = replace(gnss, position_m=position_m, sigma_m=np.full((UNITS, 3), sigma_m))
+    result = refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
+    assert result.placement is not None
+    assert result.placement.jumps.tolist() == [11]
+    assert [finding.code for finding in jump_findings(mapper, result.placement)] == ["gnss-error-jumps"]
+    aligned = align_rigid(simulated.world_from_rig[:, :3, 3], mapper.state.unit_position_m)
+    off_m = se3.apply(aligned.a_from_b, mapper.state.unit_position_m) - simulated.world_from_rig[:, :3, 3]
+    assert np.sqrt((off_m**2).sum(1).mean()) < 0.1
+    assert result.certainty is not None
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert abs(scale - 1.0) < 3 * result.certainty.sigma_scale
+
+
+@pytest.mark.parametrize("phase", [0.0, *slow(0.15, 0.35)])
+def test_a_jump_of_a_slow_receiver_is_dated_by_its_own_samples(phase: float) -> None:
+    """Units between two samples have a blend of both: those across the jump are outliers."""
+    simulated = make_simulated_drive(units=64, cameras=2, points=3000)
+    mapper = with_true_poses(make_model(simulated), simulated, range(64))
+    times_us = simulated.drive.timestamps_us
+    unit_us = float(np.median(np.diff(times_us)))
+    at_us = np.arange(times_us[0] + phase * unit_us, times_us[-1], 4.0 * unit_us).astype(np.int64)
+    quick = received(simulated, 0.02)
+    position_m = np.stack([np.interp(at_us, times_us, quick.position_m[:, axis]) for axis in range(3)], axis=1)
+    position_m[8:] += [3.0, 2.0, 0.0]
+    gnss = GnssTrack(
+        timestamps_us=at_us,
+        position_m=position_m,
+        sigma_m=np.full(position_m.shape, 0.5),
+        good=np.ones(len(at_us), dtype=np.bool_),
+    )
+    placement = place_by_gnss(mapper, gnss, ARM_M)
+    first = int(np.searchsorted(times_us, at_us[8]))
+    last = int(np.searchsorted(times_us, at_us[7], side="right")) - 1
+    assert placement.jumps.tolist() == [first]
+    assert placement.blended.tolist() == list(range(last + 1, first))
+    assert not placement.inlier[np.isin(placement.units, placement.blended)].any()
+    assert not placement.is_contradicted
 
 
 def test_rough_poses_do_not_say_where_a_scene_is_that_positions_place_afterwards() -> None:
@@ -206,3 +274,38 @@ def test_rough_poses_do_not_say_where_a_scene_is_that_positions_place_afterwards
     assert not result.placed_by_rough_poses
     off_m = np.linalg.norm(mapper.state.unit_position_m - simulated.world_from_rig[:, :3, 3], axis=1)
     assert 0.0 < off_m.max() < 0.2
+
+
+def test_positions_that_hardly_move_give_a_scene_no_scale() -> None:
+    """They are refused for that, and the rig keeps its length."""
+    simulated = stereo_drive()
+    mapper = scaled(simulated, 1.0)
+    gnss = received(simulated, 0.05)
+    drifting_m = np.linspace(0.0, 150.0, UNITS)[:, None] * [1.0, 0.0, 0.0]
+    gnss = replace(gnss, position_m=gnss.position_m + drifting_m, sigma_m=np.full((UNITS, 3), 60.0))
+    result = refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
+    assert not result.georeferenced
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.9 < scale < 1.1
+
+
+def test_positions_of_another_scale_leave_a_rig_alone_that_is_held_by_the_settings() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, given=partial(scaled_rig, scale=3.28))
+    config = EngineConfig(threads=1)
+    held = config.bundle_adjustment.model_copy(update={"refine_calibration": False})
+    config = config.model_copy(update={"bundle_adjustment": held})
+    mapper = with_true_poses(make_model(simulated, config=config), simulated, range(UNITS))
+    scale_scene(mapper, 3.28)
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    assert not result.georeferenced
+    assert result.placement is not None
+    assert "times as long as the rig's" in result.placement.reason
+
+
+@pytest.mark.parametrize("covered", [0, 1])
+def test_a_scene_with_hardly_any_position_is_left_where_it_is(covered: int) -> None:
+    simulated = stereo_drive()
+    mapper = scaled(simulated, 1.0)
+    gnss = received(simulated, 0.05)
+    gnss = replace(gnss, timestamps_us=gnss.timestamps_us + 10**9 * (np.arange(UNITS) >= covered))
+    assert not refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M)).georeferenced

@@ -59,6 +59,12 @@ def test_the_baselines_tell_by_how_much_they_were_scaled() -> None:
     assert 0.01 < sigma < 0.1  # 5 cm on some metres of baselines
 
 
+def test_a_camera_far_from_where_it_was_given_does_not_tell_the_scale() -> None:
+    mapper = true_model()
+    mapper.state.camera_position_m[2] += [1.5, 0.4, 0.0]  # 5 cm is the prior's sigma
+    assert scale_of_baselines(mapper)[0] == pytest.approx(1.0, abs=0.02)
+
+
 @pytest.mark.parametrize("turn_deg", [30.0, 89.0, 91.0, 180.0])
 def test_baselines_that_images_have_turned_neither_shrink_nor_mirror_a_scene(turn_deg: float) -> None:
     mapper = true_model(cameras=2)

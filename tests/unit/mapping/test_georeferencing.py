@@ -7,7 +7,7 @@ import pytest
 
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, align_with_gnss, assess_residuals, clock_offset
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, Refusal, align_with_gnss, assess_residuals, clock_offset
 from mrasfm_engine.synthetic.simulate import simulate_trajectory
 
 ARM_M = np.array([-0.5, 0.2, 1.8])
@@ -22,7 +22,7 @@ class Track:
     sigma_m: np.ndarray
     world_from_model: np.ndarray
 
-    def align(self) -> GnssAlignment | str:
+    def align(self) -> GnssAlignment | Refusal:
         rotation = self.model_from_rig[:, :3, :3]
         return align_with_gnss(
             self.model_from_rig[:, :3, 3] + rotation @ ARM_M,
@@ -190,8 +190,8 @@ def test_a_standing_car_gets_a_reason() -> None:
     t = track(spacing_m=1e-4)
     t.model_from_rig[:, :3, 3] += np.random.default_rng(0).normal(size=(60, 3)) * 0.002
     found = t.align()
-    assert isinstance(found, str)
-    assert "moved by" in found
+    assert isinstance(found, Refusal)
+    assert "moved by" in found.reason
 
 
 @pytest.mark.parametrize("flip", ["swapped", "mirrored"])
@@ -200,8 +200,8 @@ def test_a_track_of_another_shape_gets_a_reason(flip: str) -> None:
     # A long bend: a mirrored one cannot be turned onto it.
     t.measured_m = t.measured_m[:, [1, 0, 2]] if flip == "swapped" else t.measured_m * [-1.0, 1.0, 1.0]
     found = t.align()
-    assert isinstance(found, str)
-    assert "swapped" in found
+    assert isinstance(found, Refusal)
+    assert "swapped" in found.reason
 
 
 @pytest.mark.parametrize("latitude_deg", [10.0, 49.0, 65.0])
@@ -211,8 +211,8 @@ def test_swapped_coordinates_are_told_wherever_the_drive_is(latitude_deg: float)
     here, there = np.cos(np.radians([latitude_deg, 8.0]))
     t.measured_m = t.measured_m[:, [1, 0, 2]] * [there, 1.0 / here, 1.0]
     found = t.align()
-    assert isinstance(found, str)
-    assert "swapped" in found
+    assert isinstance(found, Refusal)
+    assert "swapped" in found.reason
 
 
 @pytest.mark.parametrize("units", [0, 1, 2])
@@ -220,8 +220,8 @@ def test_too_few_positions_are_a_reason(units: int) -> None:
     t = track(units=max(units, 1))
     cut = Track(t.model_from_rig[:units], t.measured_m[:units], t.sigma_m[:units], t.world_from_model)
     found = cut.align()
-    assert isinstance(found, str)
-    assert f"only {units} registered" in found
+    assert isinstance(found, Refusal)
+    assert f"only {units} registered" in found.reason
 
 
 def driven(times_s: np.ndarray) -> np.ndarray:

@@ -12,7 +12,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
 from mrasfm_engine.mapping.initialization import UnitScores, initialise
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.mapping_report import describe
+from mrasfm_engine.mapping.mapping_report import covered_camera_findings, describe
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement import refine
 from tests.helpers.simulated_drive import (
@@ -334,3 +334,16 @@ def test_clear_forgets_poses_and_points() -> None:
     assert not mapper.triangulated.any()
     assert not mapper.is_inlier.any()
     assert not mapper.visible_counts().any()
+
+
+def test_a_camera_whose_images_contradict_the_vehicle_all_along_is_a_finding() -> None:
+    simulated = make_simulated_drive(units=8, cameras=3, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(8))
+    of_camera = [i for i, image in enumerate(simulated.drive.images) if image.camera == 1]
+    name = simulated.drive.cameras[1].name
+    log = MappingLog(covered_images=dict.fromkeys(of_camera[:7], 0.9))
+    (finding,) = covered_camera_findings(mapper, log)
+    assert finding.code == "camera-against-rig"
+    assert f"7 of 8 images of camera {name}" in finding.what
+    # A lorry beside the vehicle for half of the drive is none.
+    assert covered_camera_findings(mapper, MappingLog(covered_images=dict.fromkeys(of_camera[:4], 0.9))) == []

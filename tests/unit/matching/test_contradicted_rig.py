@@ -1,0 +1,195 @@
+"""Cameras that are late by whole frames, or turned, in drives whose cameras have a common view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
+from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.matching.contradicted_rig import MAX_LAG, require_images_as_listed
+from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
+from mrasfm_engine.matching.pair_matching import match_pairs
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures
+from tests.helpers.simulated_drive import make_drive, random_descriptors
+
+UNITS, POINTS, FOCAL_PX, WIDTH, HEIGHT = 12, 4000, 700.0, 960, 540
+FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+CONFIG = MatchConfig()
+
+
+def looking_ahead(cameras: int) -> np.ndarray:
+    """Parallel cameras (c, 4, 4) across the vehicle."""
+    across = np.linspace(0.6, -0.6, cameras)
+    return se3.transform(np.tile(FORWARD, (cameras, 1, 1)), [[1.7, y, 1.5] for y in across])
+
+
+@dataclass(frozen=True)
+class Street:
+    """A street along which parallel cameras drive, and the images that a manifest lists."""
+
+    drive: Drive
+    features: list[ImageFeatures]
+    calibration: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+
+    def check(self, *, cancel: bool = False) -> None:
+        images = self.drive.images
+        pairs = np.array(
+            [
+                (i, j)
+                for i, a in enumerate(images)
+                for j, b in enumerate(images)
+                if i < j and a.unit == b.unit and a.camera != b.camera
+            ]
+        )
+        matcher = NearestNeighbourMatcher(CONFIG)
+        found = match_pairs(self.drive, self.features, pairs, matcher, CONFIG, self.calibration, threads=1)
+        require_images_as_listed(
+            self.drive,
+            self.features,
+            found.pairs,
+            matcher,
+            CONFIG,
+            self.calibration,
+            rig_from_cam=found.rig.rig_from_cam,
+            cancel=lambda: cancel,
+        )
+
+
+def street(
+    *,
+    cameras: int = 2,
+    late: int | None = None,
+    lag: int = 0,
+    given: np.ndarray | None = None,
+    speed_m: float = 1.2,
+    turn_deg: float = 1.7,
+    steady: bool = False,
+) -> Street:
+    """Images of a street; those of the camera `late` were taken `lag` frames before the ones they are listed with."""
+    rng = np.random.default_rng(0)
+    true = looking_ahead(cameras)
+    params = np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * cameras)
+    drive = make_drive(true if given is None else given, params, units=UNITS)
+    side = rng.choice([-1.0, 1.0], POINTS)
+    points = np.stack([rng.uniform(-10, 60, POINTS), side * rng.uniform(4, 12, POINTS), rng.uniform(-1, 8, POINTS)], 1)
+    descriptors, features = random_descriptors(POINTS, rng), []
+    for image in drive.images:
+        unit = image.unit - (lag if image.camera == late else 0)
+        # It turns, and not always by as much: else a lag looks like a camera that is mounted otherwise.
+        heading = np.radians(turn_deg) * (unit + (0.0 if steady else 2.0 * np.sin(0.9 * unit)))
+        vehicle = se3.transform(se3.exp_so3([0.0, 0.0, heading]), [speed_m * unit, 0.5 * speed_m * heading * unit, 0.0])
+        in_camera = se3.apply(se3.inverse(vehicle @ true[image.camera]), points)
+        depth = np.maximum(in_camera[:, 2:], 1e-3)
+        xy = FOCAL_PX * in_camera[:, :2] / depth + [WIDTH / 2, HEIGHT / 2] + rng.normal(size=(POINTS, 2)) * 0.3
+        seen = (in_camera[:, 2] > 1) & (xy > 0).all(1) & (xy < [WIDTH, HEIGHT]).all(1)
+        features.append(
+            ImageFeatures(
+                xy_px=xy[seen].astype(np.float32),
+                descriptors=descriptors[seen],
+                colors=np.zeros((int(seen.sum()), 3), dtype=np.uint8),
+            )
+        )
+    return Street(drive, features)
+
+
+def turned(camera: int, axis: tuple[float, float, float], turn_deg: float, *, cameras: int = 2) -> np.ndarray:
+    """The rig with a camera turned about an axis of its own."""
+    rig_from_cam = looking_ahead(cameras)
+    rig_from_cam[camera, :3, :3] = rig_from_cam[camera, :3, :3] @ se3.exp_so3(np.radians(turn_deg) * np.array(axis))
+    return rig_from_cam
+
+
+@pytest.mark.parametrize("cameras", [2, 3])
+def test_images_that_are_listed_as_they_were_taken_pass(cameras: int) -> None:
+    street(cameras=cameras).check()
+
+
+@pytest.mark.parametrize("lag", [1, -1, 2, MAX_LAG])
+def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag: int) -> None:
+    with pytest.raises(InputError) as caught:
+        street(late=1, lag=lag).check()
+    assert caught.value.code == "camera-late"
+    frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
+    assert f"listed {frames} {'before' if lag > 0 else 'after'} them" in caught.value.what
+    assert frames in caught.value.remedy
+
+
+def test_of_three_cameras_the_late_one_is_named() -> None:
+    made = street(cameras=3, late=2, lag=1)
+    with pytest.raises(InputError) as caught:
+        made.check()
+    names = [camera.name for camera in made.drive.cameras]
+    assert f"Move the images of {names[2]} by 1 frame" in caught.value.remedy
+
+
+@pytest.mark.parametrize(("axis", "turn_deg"), [((0, 0, 1), 180.0), ((0, 0, 1), 90.0), ((0, 1, 0), 45.0)])
+def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_angle(
+    axis: tuple[float, float, float], turn_deg: float
+) -> None:
+    with pytest.raises(InputError) as caught:
+        street(given=turned(1, axis, turn_deg)).check()
+    assert caught.value.code == "camera-turned"
+    assert f"turned by {turn_deg:.0f} deg" in caught.value.what
+
+
+@pytest.mark.parametrize("turn_deg", [1.0, 5.0])
+def test_a_camera_that_is_a_little_off_is_left_to_the_calibrations_own_estimate(turn_deg: float) -> None:
+    street(given=turned(1, (1, 0, 0), turn_deg)).check()
+
+
+def test_a_vehicle_that_stands_shows_no_lag() -> None:
+    street(late=1, lag=1, speed_m=0.0, given=turned(1, (1, 0, 0), 3.0)).check()
+
+
+def test_a_declared_uncertainty_of_the_rotations_is_left_to_the_estimate() -> None:
+    made = street(given=turned(1, (0, 0, 1), 60.0))
+    with pytest.raises(InputError):
+        made.check()
+    replace(made, calibration=BundleAdjustmentConfig(sigma_rotation_deg=15.0)).check()
+
+
+@pytest.mark.parametrize("off_deg", [-3.0, 3.0])
+def test_a_camera_that_is_turned_by_as_much_as_the_vehicle_turns_in_a_frame_is_not_late(off_deg: float) -> None:
+    """On a ramp, where only the place of the cameras between two frames tells both apart."""
+    street(given=turned(1, (0, 1, 0), off_deg), speed_m=0.2, turn_deg=3.0, steady=True).check()
+
+
+@pytest.mark.parametrize(("moved_px", "scale"), [((0, 0), 1.0), ((30, 0), 1.0), ((0, 300), 1.0), ((40, 10), 0.8)])
+def test_what_is_drawn_into_all_images_turns_no_camera(moved_px: tuple[float, float], scale: float) -> None:
+    """The time of day at one place of each camera's images, and nothing else in common: the cameras look apart."""
+    rng = np.random.default_rng(1)
+    apart = looking_ahead(2)
+    apart[1, :3, :3] = se3.exp_so3([0.0, 0.0, np.pi]) @ apart[1, :3, :3]
+    drive = make_drive(apart, np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * 2), units=UNITS)
+    drawn = rng.uniform([100, 20], [800, 120], (150, 2))
+    common = random_descriptors(150, rng)
+    features = []
+    for image in drive.images:
+        place = drawn if image.camera == 0 else scale * drawn + moved_px
+        features.append(
+            ImageFeatures(
+                xy_px=(place + rng.normal(size=place.shape) * 0.2).astype(np.float32),
+                descriptors=common,
+                colors=np.zeros((150, 3), dtype=np.uint8),
+            )
+        )
+    Street(drive, features).check()
+
+
+def test_the_search_ends_when_it_is_cancelled() -> None:
+    with pytest.raises(CancelledError):
+        street(late=1, lag=1).check(cancel=True)
+
+
+def test_a_drive_of_one_camera_has_nothing_to_compare() -> None:
+    made = street(cameras=1)
+    matcher = NearestNeighbourMatcher(CONFIG)
+    pairs = np.array([(i, i + 1) for i in range(UNITS - 1)])
+    found = match_pairs(made.drive, made.features, pairs, matcher, CONFIG, made.calibration, threads=1)
+    assert found.pairs
+    require_images_as_listed(made.drive, made.features, found.pairs, matcher, CONFIG, made.calibration)
