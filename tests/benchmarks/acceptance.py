@@ -22,7 +22,7 @@ makes parts of it. The results of a line are kept with commit and date, see --ke
 | 15 | how time, memory and error grow with the length of simulated routes |
 | 16 | extraction and matching beside COLMAP's, with as many keypoints, on the same pairs |
 | 17 | the service while its processes are killed: nothing lost, twice, stuck, wrong or left |
-| 18 | a real drive whose manifest is wrong: a camera pitched by 1 deg, focal lengths 1 % long |
+| 18 | a real drive whose manifest is wrong: cameras, focal lengths, and faults of its receiver and its files |
 | 19 | sigmas: halves of real drives against one another, simulated drives against the truth |
 | 20 | aggregation: seams of real and rendered drives, repeated facades, loops, vehicles, adding a scene, over HTTP |
 | 21 | real drives with poorer receivers than theirs, and with cameras left out |
@@ -82,6 +82,7 @@ from tests.benchmarks.commands import CommandFailed
 from tests.benchmarks.console import console, turned_camera, wheel
 from tests.benchmarks.correspondence import correspondence
 from tests.benchmarks.export_formats import client_wheel, exports_of_images
+from tests.benchmarks.faults import faults
 from tests.benchmarks.fisheyes import fisheyes
 from tests.benchmarks.foreign_readers import foreign_readers
 from tests.benchmarks.fresh_clone import fresh_clone
@@ -151,7 +152,7 @@ LINES = {
     "15": Line(timed=(long_routes,)),
     "16": Line(repeated=(correspondence,)),
     "17": Line(timed=(kills,)),
-    "18": Line(untimed=(wrong_manifests,)),
+    "18": Line(untimed=(wrong_manifests, faults)),
     "19": Line(untimed=(halves, simulated)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop, vehicles)),
     "21": Line(untimed=(receivers,)),

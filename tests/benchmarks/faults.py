@@ -1,0 +1,140 @@
+"""Line 18: a real drive with faults that recordings have: of its receiver, of its files, of its baselines."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
+from tests.benchmarks.real_drives import imported
+from tests.benchmarks.table import Figure, exactly
+
+METRES_A_DEGREE = 111_320.0
+LATE = "image_1"
+
+Edit = Callable[[dict[str, Any]], None]
+
+
+def faults(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 18, beside manifests that are wrong about the cameras."""
+    drive = imported(data, "kitti06", work)
+    for title, edit, finding, most_m in (
+        ("positions jump by 1 m", _jumping((25, 1.0)), "gnss-error-jumps", 0.1),
+        ("positions jump by 4 m", _jumping((25, 4.0)), "gnss-error-jumps", 0.1),
+        ("positions jump by 15 m", _jumping((25, 15.0)), "gnss-error-jumps", 0.2),
+        ("positions jump by 4 m and back by 6 m", _jumping((15, 4.0), (35, -6.0)), "gnss-error-jumps", 0.1),
+        ("a receiver that is held for 2 s", _held(15, 35), None, 0.1),
+        ("positions of 1 Hz, each written ten times", _repeated(10), None, 0.1),
+        ("baselines in feet", _scaled_baselines(1 / 0.3048), "scale-disagreement", 0.1),
+    ):
+        scene = _reconstructed(_with(drive, work / f"kitti06, {title}, drive", edit), work / f"kitti06, {title}")
+        errors, report = evaluate(scene, drive), read_report(scene)
+        yield exactly("18", f"kitti06, {title}: images registered", errors["registered_images"], 102)
+        yield Figure(
+            line="18",
+            what=f"kitti06, {title}: position, metric RMSE",
+            value=errors["metric"]["rmse_m"],
+            unit="m",
+            most=most_m,
+        )
+        stated = report["by_stage"]["refinement"]["scale"]["sigma_relative"]
+        off = abs(math.log(errors["similarity"]["scale"]))
+        yield Figure(
+            line="18",
+            what=f"kitti06, {title}: error of the scale in its sigmas",
+            value=off / stated,
+            above=-1e-9,
+            most=3.0,
+        )
+        if finding is not None:
+            found = finding in {one["code"] for one in report["findings"]}
+            yield exactly("18", f"kitti06, {title}: the finding {finding}", int(found), 1)
+    for title, edit, said in (
+        ("a camera one frame late", _late, "listed 1 frame before them"),
+        ("a camera upside down", _upside_down, "turned by 180 deg against each other"),
+    ):
+        refused = _with(drive, work / f"kitti06, {title}, drive", edit)
+        try:
+            mrasfm("reconstruct", refused, "--out", work / f"kitti06, {title}")
+            message = ""
+        except CommandFailed as error:
+            message = str(error)
+        yield exactly("18", f"kitti06, {title}: refused with the reason", int(said in message), 1)
+
+
+def _with(drive: Path, copy: Path, edit: Edit) -> Path:
+    """A copy of the drive whose manifest is edited."""
+    shutil.copytree(drive, copy)
+    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
+    edit(manifest)
+    (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
+    return copy
+
+
+def _reconstructed(drive: Path, out: Path) -> Path:
+    mrasfm("reconstruct", drive, "--out", out)
+    return out
+
+
+def _jumping(*jumps: tuple[int, float]) -> Edit:
+    """From some samples on, positions are farther north by so many metres."""
+
+    def edit(manifest: dict[str, Any]) -> None:
+        for first, by_m in jumps:
+            for sample in manifest["gnss"]["samples"][first:]:
+                sample["latitude_deg"] += by_m / METRES_A_DEGREE
+
+    return edit
+
+
+def _held(first: int, end: int) -> Edit:
+    def edit(manifest: dict[str, Any]) -> None:
+        samples = manifest["gnss"]["samples"]
+        for sample in samples[first:end]:
+            _take_position(sample, samples[first])
+
+    return edit
+
+
+def _repeated(times: int) -> Edit:
+    def edit(manifest: dict[str, Any]) -> None:
+        samples = manifest["gnss"]["samples"]
+        for k, sample in enumerate(samples):
+            _take_position(sample, samples[k - k % times])
+
+    return edit
+
+
+def _take_position(sample: dict[str, Any], other: dict[str, Any]) -> None:
+    for key in ("latitude_deg", "longitude_deg", "height_m"):
+        sample[key] = other[key]
+
+
+def _scaled_baselines(factor: float) -> Edit:
+    def edit(manifest: dict[str, Any]) -> None:
+        for camera in manifest["rig"]["cameras"]:
+            pose = camera["rig_from_cam"]
+            pose["translation_m"] = [factor * value for value in pose["translation_m"]]
+
+    return edit
+
+
+def _late(manifest: dict[str, Any]) -> None:
+    """Every frame has the image of a camera that is the one before its own; the first has none."""
+    files = [frame["images"][LATE] for frame in manifest["frames"]]
+    for frame, before in zip(manifest["frames"][1:], files[:-1], strict=True):
+        frame["images"][LATE] = before
+    del manifest["frames"][0]["images"][LATE]
+
+
+def _upside_down(manifest: dict[str, Any]) -> None:
+    """A camera is said to be turned about its axis: x and y of it are the other way round."""
+    for camera in manifest["rig"]["cameras"]:
+        if camera["name"] == LATE:
+            x, y, z, w = camera["rig_from_cam"]["rotation_xyzw"]
+            # The quaternion times (0, 0, 1, 0), a half turn about z.
+            camera["rig_from_cam"]["rotation_xyzw"] = [y, -x, w, -z]
