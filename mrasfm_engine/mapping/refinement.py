@@ -49,8 +49,8 @@ from mrasfm_engine.mapping.miscalibration import (
     find_wrong_pair,
 )
 from mrasfm_engine.mapping.moving_objects import MovingTracks, drop_moving
-from mrasfm_engine.mapping.placement import Placement
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.time_offsets import (
     SIGMA_READOUT_S,
