@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
+from tests.benchmarks.wrong_manifests import Edit, edited
 
 METRES_A_DEGREE = 111_320.0
 LATE = "image_1"
-
-Edit = Callable[[dict[str, Any]], None]
 
 
 def faults(data: Path, work: Path) -> Iterator[Figure]:
@@ -31,7 +28,8 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         ("positions of 1 Hz, each written ten times", _repeated(10), None, 0.1),
         ("baselines in feet", _scaled_baselines(1 / 0.3048), "scale-disagreement", 0.1),
     ):
-        scene = _reconstructed(_with(drive, work / f"kitti06, {title}, drive", edit), work / f"kitti06, {title}")
+        scene = work / f"kitti06, {title}"
+        mrasfm("reconstruct", edited(drive, work / f"kitti06, {title}, drive", [edit]), "--out", scene)
         errors, report = evaluate(scene, drive), read_report(scene)
         yield exactly("18", f"kitti06, {title}: images registered", errors["registered_images"], 102)
         yield Figure(
@@ -57,27 +55,13 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         ("a camera one frame late", _late, "listed 1 frame before them"),
         ("a camera upside down", _upside_down, "turned by 180 deg against each other"),
     ):
-        refused = _with(drive, work / f"kitti06, {title}, drive", edit)
+        refused = edited(drive, work / f"kitti06, {title}, drive", [edit])
         try:
             mrasfm("reconstruct", refused, "--out", work / f"kitti06, {title}")
             message = ""
         except CommandFailed as error:
             message = str(error)
         yield exactly("18", f"kitti06, {title}: refused with the reason", int(said in message), 1)
-
-
-def _with(drive: Path, copy: Path, edit: Edit) -> Path:
-    """A copy of the drive whose manifest is edited."""
-    shutil.copytree(drive, copy)
-    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
-    edit(manifest)
-    (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return copy
-
-
-def _reconstructed(drive: Path, out: Path) -> Path:
-    mrasfm("reconstruct", drive, "--out", out)
-    return out
 
 
 def _jumping(*jumps: tuple[int, float]) -> Edit:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -87,15 +87,19 @@ def _rmse(title: str, errors: dict[str, Any], most_m: float) -> Figure:
     )
 
 
-def _reconstructed(drive: Path, out: Path, edits: list[Edit], *options: object) -> Path:
-    """The scene of a copy of the drive whose manifest is edited."""
-    copy = out.with_name(out.name + ", drive")
+def edited(drive: Path, copy: Path, edits: Sequence[Edit]) -> Path:
+    """A copy of the drive whose manifest is edited."""
     shutil.copytree(drive, copy)
     manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
     for edit in edits:
         edit(manifest)
     (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    mrasfm("reconstruct", copy, "--out", out, *options)
+    return copy
+
+
+def _reconstructed(drive: Path, out: Path, edits: Sequence[Edit], *options: object) -> Path:
+    """The scene of a copy of the drive whose manifest is edited."""
+    mrasfm("reconstruct", edited(drive, out.with_name(out.name + ", drive"), edits), "--out", out, *options)
     return out
 
 
