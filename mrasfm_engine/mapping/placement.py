@@ -112,7 +112,7 @@ def place_by_gnss(
         off_m=antenna_places_m(mapper, units, antenna_in_rig_m) - measured[units],
         interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
         noise_factor=alignment.noise_factor,
-        samples=Samples.of_track(gnss),
+        samples=Samples.of_track(gnss) if mapper.config.bundle_adjustment.reassessment else None,
     )
     placement = _with_prior(mapper, placement, thorough=thorough)
     if not single:

@@ -84,7 +84,7 @@ class Placement:
     inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
     off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
     interval_us: float = 0.0  # of the receiver's samples
-    samples: Samples | None = None  # of the receiver, where its error may jump
+    samples: Samples | None = None  # of the receiver, where jumps of its error are looked for
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     jumps: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (k,) units from which on it is another
