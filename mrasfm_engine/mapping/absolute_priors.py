@@ -112,6 +112,22 @@ class AbsolutePriors:
             )
         self._renew_rough(mapper)
 
+    def doubt_the_rig(self, mapper: Mapper) -> None:
+        """Take the scale of positions that contradict nothing but the rig's baselines, where these may vary."""
+        settings, refused = mapper.config.bundle_adjustment, self.placement
+        may_vary = (
+            settings.refine_calibration
+            and settings.camera_set_adjustment
+            and settings.priors
+            and settings.reassessment
+            and not mapper.drive.has_single_camera
+        )
+        if refused is None or not refused.is_of_another_scale or not may_vary:
+            return
+        self.place(mapper, rig_may_be_wrong=True)
+        if self.positions_are_refused:
+            self.placement = refused
+
     def renew(self, mapper: Mapper) -> None:
         """Judge them by the scene as it is now, and place the scene if that is not done yet.
 

@@ -31,7 +31,6 @@ from mrasfm_engine.mapping.receiver_fit import (
     MIN_POSITIONS,
     Placement,
     ReceiverErrors,
-    Samples,
     antenna_places_m,
     most_likely_errors,
     receiver_errors,
@@ -112,7 +111,7 @@ def place_by_gnss(
         off_m=antenna_places_m(mapper, units, antenna_in_rig_m) - measured[units],
         interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
         noise_factor=alignment.noise_factor,
-        samples=Samples.of_track(gnss) if mapper.config.bundle_adjustment.reassessment else None,
+        track=gnss if mapper.config.bundle_adjustment.reassessment else None,
     )
     placement = _with_prior(mapper, placement, thorough=thorough)
     if not single:
@@ -229,7 +228,7 @@ def _align(
 ) -> GnssAlignment | Refusal:
     rotation = mapper.state.unit_rotation[units]
     return align_with_gnss(
-        mapper.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
+        antenna_places_m(mapper, units, antenna_in_rig_m),
         rotation[:, :, 2],
         rotation[:, :, 0],
         measured[units],
@@ -253,10 +252,9 @@ def _fits_swapped(
     """True where positions with latitude and longitude swapped have the trajectory's shape at the rig's scale."""
     if gnss.swapped_from_local is None:
         return False
-    rotation = mapper.state.unit_rotation[units]
     return has_shape(
-        mapper.state.unit_position_m[units] + rotation @ antenna_in_rig_m,
-        rotation[:, :, 2],
+        antenna_places_m(mapper, units, antenna_in_rig_m),
+        mapper.state.unit_rotation[units][:, :, 2],
         measured[units] @ gnss.swapped_from_local.T,
         sigma[units],
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,

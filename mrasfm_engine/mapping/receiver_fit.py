@@ -51,23 +51,6 @@ class ReceiverErrors:
         return bool((np.abs(np.log(sizes[0] / sizes[1])) < np.log(STEADY)).all())
 
 
-@dataclass(frozen=True, kw_only=True)
-class Samples:
-    """A receiver's positions as it gave them, ascending in time."""
-
-    time_s: Floats  # (m,)
-    position_m: Floats  # (m, 3)
-    sigma_m: Floats  # (m, 3)
-
-    @staticmethod
-    def of_track(track: GnssTrack) -> Samples:
-        """The track's samples but for gross errors."""
-        good = track.good
-        return Samples(
-            time_s=track.timestamps_us[good] / 1e6, position_m=track.position_m[good], sigma_m=track.sigma_m[good]
-        )
-
-
 @dataclass(kw_only=True)
 class Placement:
     """Fit of the reconstruction to the receiver's positions; without a prior it does not fit, for the reason given."""
@@ -84,7 +67,7 @@ class Placement:
     inlier: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (n,)
     off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
     interval_us: float = 0.0  # of the receiver's samples
-    samples: Samples | None = None  # of the receiver, where jumps of its error are looked for
+    track: GnssTrack | None = None  # the receiver's, where jumps of its error are looked for
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     jumps: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (k,) units from which on it is another
@@ -110,7 +93,7 @@ def with_jumps(mapper: Mapper, placement: Placement) -> Placement:
     """
     none = np.zeros(0, dtype=np.int64)
     placement = replace(placement, jumps=none, blended=none, level_m=np.zeros((1, 3)))
-    if placement.samples is None or len(placement.units) < MIN_POSITIONS:
+    if placement.track is None or len(placement.units) < MIN_POSITIONS:
         return placement
     times_s = mapper.drive.timestamps_us[placement.units] / 1e6
     before_s, after_s = _jump_times_s(mapper, placement, times_s)
@@ -119,9 +102,8 @@ def with_jumps(mapper: Mapper, placement: Placement) -> Placement:
     between = (times_s[:, None] > before_s) & (times_s[:, None] < after_s)
     blended = np.asarray(between.any(axis=1), dtype=np.bool_)
     segment = np.searchsorted(after_s, times_s, side="right")
-    parts = np.unique(segment)
     level_m = np.zeros((len(after_s) + 1, 3))
-    for part in parts:
+    for part in np.unique(segment):  # some may be shorter than the time between units
         level_m[part] = np.median(placement.off_m[segment == part], axis=0)
     # The scene may lie between them: an adjustment moves it to the largest one, as a whole.
     inlier, factor = assess_residuals(
@@ -131,14 +113,13 @@ def with_jumps(mapper: Mapper, placement: Placement) -> Placement:
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,
     )
     inlier &= ~blended
-    if len(parts) < 2 or inlier.sum() < MIN_POSITIONS:
+    if inlier.sum() < MIN_POSITIONS:
         return placement
     return replace(
         placement,
         inlier=inlier,
         noise_factor=factor,
-        # A part without a unit begins where the next one does.
-        jumps=np.append(placement.units, placement.units[-1] + 1)[np.searchsorted(times_s, after_s)],
+        jumps=placement.units[np.searchsorted(times_s, after_s)],
         blended=placement.units[blended],
         level_m=level_m - level_m[np.bincount(segment).argmax()],
     )
@@ -150,21 +131,20 @@ def _jump_times_s(mapper: Mapper, placement: Placement, times_s: Floats) -> tupl
     A sample is compared with the scene at its own time: positions that are interpolated have no steps. Of samples that
     come more often than units, those nearest to units take part.
     """
-    samples = placement.samples
-    assert samples is not None
-    unit_s = float(np.median(np.diff(times_s)))
-    among = (samples.time_s >= times_s[0]) & (samples.time_s <= times_s[-1])
-    if placement.interval_us / 1e6 < 0.75 * unit_s:
-        among &= np.isin(np.arange(len(among)), nearest(samples.time_s[:, None], times_s[:, None])[1][:, 0])
-    rows = np.flatnonzero(among)
+    track = placement.track
+    assert track is not None
+    unit_s, sample_s = float(np.median(np.diff(times_s))), track.timestamps_us / 1e6
+    rows = np.flatnonzero(track.good & (sample_s >= times_s[0]) & (sample_s <= times_s[-1]))
+    if len(rows) and placement.interval_us / 1e6 < 0.75 * unit_s:
+        rows = rows[np.unique(nearest(sample_s[rows, None], times_s[:, None])[1])]
     # Where no unit is near, the scene says nothing of where the antenna was.
-    after = np.clip(np.searchsorted(times_s, samples.time_s[rows]), 1, len(times_s) - 1)
+    after = np.clip(np.searchsorted(times_s, sample_s[rows]), 1, len(times_s) - 1)
     rows = rows[times_s[after] - times_s[after - 1] <= MAX_BETWEEN_UNITS * unit_s]
-    at_s, antenna_m = samples.time_s[rows], antenna_places_m(mapper, placement.units, placement.lever_arm_m)
+    at_s, antenna_m = sample_s[rows], antenna_places_m(mapper, placement.units, placement.lever_arm_m)
     there_m = np.stack([np.interp(at_s, times_s, antenna_m[:, axis]) for axis in range(3)], axis=1)
     first = find_jumps(
-        there_m - samples.position_m[rows],
-        samples.sigma_m[rows],
+        there_m - track.position_m[rows],
+        track.sigma_m[rows],
         at_s,
         wander_time_s=mapper.config.gnss.wander_time_s,
     )

@@ -51,7 +51,7 @@ from mrasfm_engine.mapping.miscalibration import (
 from mrasfm_engine.mapping.moving_objects import MovingTracks, drop_moving
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.receiver_fit import Placement
-from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
+from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road, road_where_points_are
 from mrasfm_engine.mapping.time_offsets import (
     SIGMA_READOUT_S,
     TimeCertainty,
@@ -151,7 +151,7 @@ def refine(
     if absolute.positions_are_refused:
         _compare_positions_again(mapper, result, cancel)
     if calibrated is None:
-        _doubt_the_rig(mapper, absolute)
+        absolute.doubt_the_rig(mapper)
     placed = result.georeferenced or result.placed_by_rough_poses
     if not placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
@@ -243,7 +243,7 @@ def refine(
             holds_mean_time=mean_time_varied and not result.mean_time_varies,
             cancel=cancel,
         )
-        _judge_road_again(mapper, result)
+        result.road = road_where_points_are(mapper, result.road)
         if result.times is not None:
             offset_s = mapper.state.camera_time_offset_s
             prior = time_prior(mapper, mean_varies=result.mean_time_varies)
@@ -252,17 +252,6 @@ def refine(
         result.miscalibrations = find_miscalibrations(*known)
         result.wrong_pair = find_wrong_pair(*known)
     return result
-
-
-def _doubt_the_rig(mapper: Mapper, absolute: AbsolutePriors) -> None:
-    """Take the scale of positions that contradict nothing but the rig's baselines, where these may vary."""
-    settings, placement = mapper.config.bundle_adjustment, absolute.placement
-    may_vary = settings.refine_calibration and settings.camera_set_adjustment and _reassesses(mapper)
-    if placement is None or not placement.is_of_another_scale or not may_vary or mapper.drive.has_single_camera:
-        return
-    absolute.place(mapper, rig_may_be_wrong=True)
-    if absolute.positions_are_refused:
-        absolute.placement = placement
 
 
 def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel | None) -> None:
@@ -422,21 +411,6 @@ def _hold_unobserved(
     if behind_px > BEHIND * result.sigma_px:  # units and points are no longer where the images want them
         terms, options = result.absolute.terms(mapper), _options(mapper, result.sigma_px)
         result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
-
-
-def _judge_road_again(mapper: Mapper, result: Refinement) -> None:
-    """Find the road anew where its points have moved from its surface since, by more than the road is uneven.
-
-    Where none is found, the one that was found stays.
-    """
-    road = result.road
-    if not isinstance(road, RoadAssessment):
-        return
-    distance_m, patch = road.fitted.surface.locate(mapper.state.points_m[road.tracks])
-    kept = road.is_inlier & (patch >= 0) & np.isfinite(road.distance_m)
-    if kept.any() and float(np.median(np.abs(distance_m - road.distance_m)[kept])) > road.road.roughness_m:
-        again = drop_off_road(mapper, for_map=True)
-        result.road = again if isinstance(again, RoadAssessment) else road
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:

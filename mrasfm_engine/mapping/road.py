@@ -118,6 +118,21 @@ def drop_off_road(
     return judgement
 
 
+def road_where_points_are(mapper: Mapper, road: RoadAssessment | str) -> RoadAssessment | str:
+    """The road of the map, found anew where its points have moved from its surface by more than the road is uneven.
+
+    Where none is found, the one that was found stays.
+    """
+    if not isinstance(road, RoadAssessment):
+        return road
+    distance_m, patch = road.fitted.surface.locate(mapper.state.points_m[road.tracks])
+    kept = road.is_inlier & (patch >= 0) & np.isfinite(road.distance_m)
+    if not kept.any() or np.median(np.abs(distance_m - road.distance_m)[kept]) <= road.fitted.roughness_m:
+        return road
+    again = drop_off_road(mapper, for_map=True)
+    return again if isinstance(again, RoadAssessment) else road
+
+
 def _points_of_the_road(mapper: Mapper, world_from_rig: Floats, *, for_map: bool) -> tuple[RoadSource, Ints] | str:
     """Tracks whose points are taken for the road's, and what says so; else why there are none."""
     if (mapper.track_class == ROAD).any():

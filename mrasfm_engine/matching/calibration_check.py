@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import cv2
 import numpy as np
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import (
-    MIN_RANSAC_MATCHES,
     epipolar_errors,
     essential_inliers,
     in_front_of_both,
     parallax_rad,
+    relative_pose,
 )
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -28,6 +26,7 @@ from schemas import BodyAxes
 
 MIN_INLIERS = 50
 MIN_PARALLAX_RAD = np.radians(0.3)  # about 3 px at a focal length of 600 px
+MOTION_ERROR = 2e-3  # of a match between two units, in the plane z = 1
 PAIR_ERROR_PX = 4.0  # from the epipolar line of a calibration that is the right way round
 CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of the inverse, and of what was given, for a verdict
 MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
@@ -135,13 +134,9 @@ def share_explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays
 
 def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:
     """Direction from camera a to camera b: a unit vector."""
-    ok = (rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD)
-    if ok.sum() < MIN_RANSAC_MATCHES:
+    found = relative_pose(rays_a, rays_b, max_error=MOTION_ERROR, confidence=0.999)
+    if found is None:
         return None
-    a, b = rays_a[ok, :2] / rays_a[ok, 2:], rays_b[ok, :2] / rays_b[ok, 2:]
-    essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, 0.999, 2e-3)
-    if essential is None or essential.shape != (3, 3):
-        return None
-    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3), mask=mask)
-    result: Floats = -(rotation.T @ translation).ravel()
+    rotation, translation = found
+    result: Floats = -(rotation.T @ translation)
     return result

@@ -11,10 +11,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
 
-import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -30,12 +27,12 @@ from mrasfm_engine.matching.calibration_check import (
     PAIR_ERROR_PX,
     share_explained,
 )
-from mrasfm_engine.matching.prepared_images import Matcher
-from mrasfm_engine.matching.simultaneous import are_simultaneous, calibration_sigmas
-from mrasfm_engine.matching.verification import essential_inliers
+from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
+from mrasfm_engine.matching.simultaneous import are_simultaneous, calibration_sigmas, max_error_rad
+from mrasfm_engine.matching.verification import essential_inliers, relative_pose
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+from mrasfm_engine.types import Bools, Cancel, Floats
 
 MIN_UNITS = 3  # in which two cameras contradict the calibration
 SAMPLED_UNITS = 8
@@ -106,14 +103,17 @@ def require_images_as_listed(
     contradicted = {cameras: found for cameras, found in compared.items() if found.share < CLEARLY_BETTER}
     if not contradicted:
         return
-    search = _Search(drive=drive, features=features, matcher=matcher, config=config, cancel=cancel)
+    searches = {
+        cameras: _Search(drive, features, matcher, config, cameras, found, cancel)
+        for cameras, found in contradicted.items()
+    }
     with threadpool_limits(1, "blas"):
-        turns_deg = {cameras: search.turn_deg(cameras, found.units) for cameras, found in contradicted.items()}
+        turns_deg = {cameras: search.turn_deg() for cameras, search in searches.items()}
         # In a steady turn, a camera that is late looks like one that is turned, and by less than a calibration errs.
         lags = {
             cameras: lag
-            for cameras, found in contradicted.items()
-            if turns_deg[cameras] < STEADY_TURN_DEG and (lag := search.lag(cameras, found))
+            for cameras, search in searches.items()
+            if turns_deg[cameras] < STEADY_TURN_DEG and (lag := search.lag())
         }
         if lags:
             agree = {camera for cameras in compared.keys() - contradicted.keys() for camera in cameras}
@@ -134,6 +134,7 @@ def _compared(
 ) -> dict[tuple[int, int], _Comparison]:
     """Shares of their matches by which pairs of cameras with a common view fit the rig that explains them best."""
     kinds, params = pack_cameras(drive.cameras)
+    focal_px = params[:, :2].mean(1)
     by_cameras: dict[tuple[int, int], list[PairMatches]] = {}
     for pair in pairs:
         if are_simultaneous(drive, pair.image_a, pair.image_b) and len(pair.matches) >= MIN_INLIERS:
@@ -141,7 +142,7 @@ def _compared(
             by_cameras.setdefault(cameras, []).append(pair)
     result = {}
     for (a, b), found in sorted(by_cameras.items()):
-        focal_px, shares, units = float(params[[a, b], 0].min()), [], []
+        shares, units, gate = [], [], PAIR_ERROR_PX / float(focal_px[[a, b]].min())
         for pair in _evenly(found):
             rays_a, rays_b = (
                 unproject_pixels(int(kinds[camera]), params[camera], features[image].xy_px[rows])
@@ -149,9 +150,9 @@ def _compared(
             )
             kept = pair.inliers
             if kept.sum() < MIN_INLIERS:  # the calibration left none of them
-                kept = essential_inliers(rays_a, rays_b, max_error=config.max_error_px / focal_px)
+                max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config)
+                kept = essential_inliers(rays_a, rays_b, max_error=max_error)
             if kept.sum() >= MIN_INLIERS:
-                gate = PAIR_ERROR_PX / focal_px
                 shares.append([share_explained(rig[a], rig[b], rays_a[kept], rays_b[kept], gate) for rig in rigs])
                 units.append(drive.images[pair.image_a].unit)
         if len(shares) >= MIN_UNITS:
@@ -164,88 +165,79 @@ def _evenly(found: Sequence[PairMatches]) -> list[PairMatches]:
     return [found[k] for k in chosen]
 
 
-@dataclass(kw_only=True)
 class _Search:
-    """Matches of images that are listed in different frames, or as those of differently turned cameras."""
+    """Matches of two cameras' images that are listed in different frames, or as those of differently turned cameras."""
 
-    drive: Drive
-    features: Sequence[ImageFeatures]
-    matcher: Matcher
-    config: MatchConfig
-    cancel: Cancel | None
+    def __init__(
+        self,
+        drive: Drive,
+        features: Sequence[ImageFeatures],
+        matcher: Matcher,
+        config: MatchConfig,
+        cameras: tuple[int, int],
+        listed: _Comparison,
+        cancel: Cancel | None,
+    ) -> None:
+        self._drive, self._matcher, self._config, self._cancel = drive, matcher, config, cancel
+        self._rig = drive.rig_from_cam[list(cameras)]
+        self._focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(1)
+        self._gate = PAIR_ERROR_PX / float(self._focal_px[list(cameras)].min())
+        self._listed = listed
+        where = {(image.unit, image.camera): i for i, image in enumerate(drive.images)}
+        # By unit: an image is prepared once.
+        self._pairs = [
+            (lag, where[u, cameras[0]], where[u + lag, cameras[1]])
+            for u in listed.units
+            for lag in range(-MAX_LAG, MAX_LAG + 1)
+            if (u, cameras[0]) in where and (u + lag, cameras[1]) in where
+        ]
+        pairs = np.array([(a, b) for _, a, b in self._pairs], dtype=np.int64)
+        self._images = PreparedImages(drive, features, matcher, pairs, threads=1)
+        self._keypoints = features
 
-    def lag(self, cameras: tuple[int, int], listed: _Comparison) -> int:
+    def lag(self) -> int:
         """Frames by which the second camera's images come after those of the first that they fit; 0 for none.
 
-        They have to fit well there, and far better than as they are `listed`.
+        They have to fit well there, and far better than as they are listed.
         """
-        a, b = cameras
-        where = {(image.unit, image.camera): i for i, image in enumerate(self.drive.images)}
-        shares = {}
-        for lag in (lag for size in range(1, MAX_LAG + 1) for lag in (size, -size)):
-            found = [
-                share_explained(
-                    self.drive.rig_from_cam[a], self.drive.rig_from_cam[b], rays.a, rays.b, self._gate(cameras)
-                )
-                for u in listed.units
-                if (u, a) in where
-                and (u + lag, b) in where
-                and (rays := self._verified(where[u, a], where[u + lag, b])) is not None
-            ]
-            if len(found) >= MIN_UNITS:
-                shares[lag] = float(np.median(found))
-        best = max(shares, key=lambda lag: shares[lag], default=0)
-        if not best or shares[best] < CLEARLY_BETTER or 1.0 - shares[best] > LEFT_SHARE * (1.0 - listed.share):
-            return 0
-        return best
+        found: dict[int, list[float]] = {}
+        for lag, a, b in self._pairs:
+            rays = self._verified(a, b) if lag else None
+            if rays is not None:
+                share = share_explained(self._rig[0], self._rig[1], rays.a, rays.b, self._gate)
+                found.setdefault(lag, []).append(share)
+        shares = {lag: float(np.median(some)) for lag, some in found.items() if len(some) >= MIN_UNITS}
+        best = max(shares, key=lambda lag: (shares[lag], -abs(lag), lag), default=0)
+        left = 1.0 - shares.get(best, 0.0)
+        return best if left <= min(1.0 - CLEARLY_BETTER, LEFT_SHARE * (1.0 - self._listed.share)) else 0
 
-    def turn_deg(self, cameras: tuple[int, int], units: Sequence[int]) -> float:
+    def turn_deg(self) -> float:
         """Angle by which images show two cameras turned against each other from where they are given; 0 for none."""
-        a, b = cameras
-        where = {(image.unit, image.camera): i for i, image in enumerate(self.drive.images)}
-        found = [self._verified(where[u, a], where[u, b]) for u in units]
-        rays = _without_drawn([one for one in found if one is not None])
+        pairs = [(a, b) for lag, a, b in self._pairs if lag == 0]
+        rays = _without_drawn([one for a, b in pairs if (one := self._verified(a, b)) is not None])
         if len(rays) < MIN_UNITS:
             return 0.0
-        max_error = self.config.max_error_px / float(self._lenses[1][list(cameras), 0].min())
+        max_error = max_error_rad(self._drive, pairs[0][0], pairs[0][1], self._focal_px, self._config)
         b_from_a = _common_rotation([one.a for one in rays], [one.b for one in rays], max_error)
         if b_from_a is None:
             return 0.0
-        given = self.drive.rig_from_cam[b, :3, :3].T @ self.drive.rig_from_cam[a, :3, :3]
+        given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
         return float(se3.rotation_angle_deg(given.T @ b_from_a))
-
-    def _gate(self, cameras: tuple[int, int]) -> float:
-        return PAIR_ERROR_PX / float(self._lenses[1][list(cameras), 0].min())
-
-    @cached_property
-    def _lenses(self) -> tuple[Ints, Floats]:
-        return pack_cameras(self.drive.cameras)
-
-    @cached_property
-    def _prepared(self) -> dict[int, Any]:
-        return {}
-
-    def _for_matcher(self, image: int) -> Any:
-        """The image prepared for the matcher, once: some units of a few cameras."""
-        if image not in self._prepared:
-            lens = self.drive.cameras[self.drive.images[image].camera]
-            prepared = self.matcher.prepare(self.features[image], width=lens.width, height=lens.height)
-            self._prepared[image] = prepared
-        return self._prepared[image]
 
     def _verified(self, image_a: int, image_b: int) -> _Rays | None:
         """Rays of the matches that agree with an essential matrix; None where they are few."""
-        if self.cancel is not None and self.cancel():
+        if self._cancel is not None and self._cancel():
             raise CancelledError
-        kinds, params = self._lenses
-        cameras = [self.drive.images[image].camera for image in (image_a, image_b)]
-        matches = self.matcher.match(self._for_matcher(image_a), self._for_matcher(image_b))
-        xy = [self.features[image].xy_px[rows] for image, rows in zip((image_a, image_b), matches.T, strict=True)]
-        rays = [unproject_pixels(int(kinds[c]), params[c], of_image) for c, of_image in zip(cameras, xy, strict=True)]
-        max_error = self.config.max_error_px / float(params[cameras, 0].min())
-        good = essential_inliers(rays[0], rays[1], max_error=max_error)
-        found = _Rays(a=rays[0], b=rays[1], xy_a_px=xy[0], xy_b_px=xy[1]).at(good)
-        return found if len(found.a) >= MIN_INLIERS else None
+        of_a, of_b = (self._images.prepared(image).for_matcher for image in (image_a, image_b))
+        matches = self._matcher.match(of_a, of_b)
+        parts = [
+            (self._images.rays(image)[rows], self._keypoints[image].xy_px[rows])
+            for image, rows in zip((image_a, image_b), matches.T, strict=True)
+        ]
+        found = _Rays(a=parts[0][0], b=parts[1][0], xy_a_px=parts[0][1], xy_b_px=parts[1][1])
+        max_error = max_error_rad(self._drive, image_a, image_b, self._focal_px, self._config)
+        good = essential_inliers(found.a, found.b, max_error=max_error)
+        return found.at(good) if good.sum() >= MIN_INLIERS else None
 
 
 def _without_drawn(units: Sequence[_Rays]) -> list[_Rays]:
@@ -272,17 +264,8 @@ def _common_rotation(rays_a: Sequence[Floats], rays_b: Sequence[Floats], max_err
     a, b = np.concatenate(rays_a), np.concatenate(rays_b)
     good = essential_inliers(a, b, max_error=max_error)
     # The matches of each unit have a matrix that they agree with; one of all shows that the cameras are fixed.
-    if good.mean() < CLEARLY_BETTER:
-        return None
-    ahead = good & (a[:, 2] > 0.1) & (b[:, 2] > 0.1)
-    plane_a, plane_b = a[ahead, :2] / a[ahead, 2:], b[ahead, :2] / b[ahead, 2:]
-    if len(plane_a) < MIN_INLIERS:
-        return None
-    essential, mask = cv2.findEssentialMat(plane_a, plane_b, np.eye(3), cv2.USAC_ACCURATE, 0.9999, max_error)
-    if essential is None or essential.shape != (3, 3):
-        return None
-    _, rotation, _, _ = cv2.recoverPose(essential, plane_a, plane_b, np.eye(3), mask=mask)
-    return np.asarray(rotation, dtype=np.float64)
+    pose = relative_pose(a[good], b[good], max_error=max_error) if good.mean() >= CLEARLY_BETTER else None
+    return None if pose is None else pose[0]
 
 
 def _late(drive: Drive, lags: dict[tuple[int, int], int], agree: set[int]) -> InputError:

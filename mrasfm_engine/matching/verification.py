@@ -35,14 +35,31 @@ def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bo
     return _plane_inliers(rays_a, rays_b, max_error)[0]
 
 
-def _plane_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> tuple[Bools, Floats | None]:
+def relative_pose(
+    rays_a: Floats, rays_b: Floats, *, max_error: float, confidence: float = CONFIDENCE
+) -> tuple[Floats, Floats] | None:
+    """Rotation b_from_a (3, 3) and direction (3,) of the translation that most matches agree with, found by RANSAC.
+
+    None where there are too few in the plane z = 1, in which they are judged.
+    """
+    inliers, essential = _plane_inliers(rays_a, rays_b, max_error, confidence)
+    if essential is None or not inliers.any():
+        return None
+    a, b = (rays[inliers, :2] / rays[inliers, 2:] for rays in (rays_a, rays_b))
+    _, rotation, translation, _ = cv2.recoverPose(essential, a, b, np.eye(3))
+    return np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64).ravel()
+
+
+def _plane_inliers(
+    rays_a: Floats, rays_b: Floats, max_error: float, confidence: float = CONFIDENCE
+) -> tuple[Bools, Floats | None]:
     """Inliers (n,) by their distances in the plane z = 1, and the essential matrix if there is one."""
     inliers = np.zeros(len(rays_a), dtype=np.bool_)
     usable = np.flatnonzero((rays_a[:, 2] > MIN_FORWARD) & (rays_b[:, 2] > MIN_FORWARD))
     if len(usable) < MIN_RANSAC_MATCHES:
         return inliers, None
     a, b = rays_a[usable, :2] / rays_a[usable, 2:], rays_b[usable, :2] / rays_b[usable, 2:]
-    essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, CONFIDENCE, max_error)
+    essential, mask = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_ACCURATE, confidence, max_error)
     if essential is None or essential.shape != (3, 3):
         return inliers, None
     inliers[usable] = mask.ravel() > 0

@@ -10,7 +10,7 @@ from typing import Any
 from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
-from tests.benchmarks.wrong_manifests import Edit, edited
+from tests.benchmarks.wrong_manifests import Edit, edited, rmse
 
 METRES_A_DEGREE = 111_320.0
 LATE = "image_1"
@@ -32,13 +32,7 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         mrasfm("reconstruct", edited(drive, work / f"kitti06, {title}, drive", [edit]), "--out", scene)
         errors, report = evaluate(scene, drive), read_report(scene)
         yield exactly("18", f"kitti06, {title}: images registered", errors["registered_images"], 102)
-        yield Figure(
-            line="18",
-            what=f"kitti06, {title}: position, metric RMSE",
-            value=errors["metric"]["rmse_m"],
-            unit="m",
-            most=most_m,
-        )
+        yield rmse(f"kitti06, {title}", errors, most_m)
         stated = report["by_stage"]["refinement"]["scale"]["sigma_relative"]
         off = abs(math.log(errors["similarity"]["scale"]))
         yield Figure(

@@ -47,7 +47,7 @@ def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
             scene = _reconstructed(drive, work / f"{title}, {receiver}", edits, *options)
             errors = evaluate(scene, drive)
             yield exactly("18", f"{title}, {receiver}: images registered", errors["registered_images"], 102)
-            yield _rmse(f"{title}, {receiver}", errors, most_m)
+            yield rmse(f"{title}, {receiver}", errors, most_m)
             yield Figure(
                 line="18",
                 what=f"{title}, {receiver}: error of the relative rotation",
@@ -64,7 +64,7 @@ def _focal_lengths(drive: Path, work: Path) -> Iterator[Figure]:
     settings.write_text(f"[bundle_adjustment]\nrefine_focal = true\nsigma_focal = {SIGMA_FOCAL}\n", encoding="utf-8")
     title = "kitti06, focal lengths 1 % long, GNSS"
     scene = _reconstructed(drive, work / title, [_long_focal_lengths], "--config", settings)
-    yield _rmse(title, evaluate(scene, drive), 0.03)
+    yield rmse(title, evaluate(scene, drive), 0.03)
     held = sum(finding["code"] == "focal-not-observed" for finding in read_report(scene)["findings"])
     yield exactly("18", f"{title}: cameras whose focal length is held, with a finding", held, 2)
     turning = work / "turning"
@@ -81,7 +81,8 @@ def _focal_lengths(drive: Path, work: Path) -> Iterator[Figure]:
     yield Figure(line="18", what=f"{title}: worst focal length's error in sigmas", value=in_sigmas, most=3.0)
 
 
-def _rmse(title: str, errors: dict[str, Any], most_m: float) -> Figure:
+def rmse(title: str, errors: dict[str, Any], most_m: float) -> Figure:
+    """Position error of a scene, by what `evaluate` says."""
     return Figure(
         line="18", what=f"{title}: position, metric RMSE", value=errors["metric"]["rmse_m"], unit="m", most=most_m
     )
