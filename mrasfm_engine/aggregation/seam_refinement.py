@@ -30,6 +30,10 @@ OBSERVATIONS_OF_IMAGE = 100  # from which transforms are estimated: each has tho
 INITIAL_DAMPING = 1e-6  # scenes lie nearly right before they are adjusted
 SCALE_LOSS = 3.0  # of residuals of shared points, in their median
 CORRELATION = 4.0  # errors that keypoints of one image share: so many of them count once
+# Newton decrement of the last step. Twice as much is how far the transforms, all together, are from the minimum, in
+# squared sigmas of independent errors: half a standard deviation of theirs. Scenes are more bent than that, and the
+# robust weights of what does not fit would still move for as many steps again.
+DECREMENT_TOLERANCE = CORRELATION / 8.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,6 +147,7 @@ def transform_problem(
         options=SolverOptions(
             max_iterations=iterations,
             function_tolerance=1e-6,
+            decrement_tolerance=DECREMENT_TOLERANCE,
             initial_damping=INITIAL_DAMPING,
             loss_scale=config.bundle_adjustment.loss_scale,
             threads=config.threads,

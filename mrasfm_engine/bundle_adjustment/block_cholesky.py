@@ -32,6 +32,7 @@ from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats, Ints
 
 BLOCK = 6
+RIGHT_HAND_SIDES = 8  # next to one another, that are skipped together where all are zero
 FULL = 0.8  # of all places: where so many are taken, no order leaves others empty
 
 
@@ -203,22 +204,45 @@ def _factorise(first: Any, row: Any, l: Any) -> bool:  # noqa: E741
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def _solve(first: Any, row: Any, l: Any, x: Any) -> None:  # noqa: E741
-    """Turn right-hand sides x (columns, 6, m) into solutions."""
+def _forward(first: Any, row: Any, l: Any, x: Any) -> None:  # noqa: E741
+    """Turn right-hand sides x (columns, 6, m) into L^-1 x.
+
+    Of those that are zero down to a column it does nothing there: the cameras of one scene of a map, of which most
+    units know nothing.
+    """
     n, m = len(first) - 1, x.shape[2]
+    begins, ends = np.empty(m + 1, np.int64), np.empty(m + 1, np.int64)  # runs of right-hand sides that are not zero
     for j in range(n):
-        d = first[j]
-        for a in range(BLOCK):
-            for b in range(a):
-                for q in range(m):
-                    x[j, a, q] -= l[d, a, b] * x[j, b, q]
-            for q in range(m):
-                x[j, a, q] /= l[d, a, a]
-        for s in range(d + 1, first[j + 1]):
+        d, runs = first[j], 0
+        for lo in range(0, m, RIGHT_HAND_SIDES):
+            hi, some = min(lo + RIGHT_HAND_SIDES, m), False
             for a in range(BLOCK):
-                for b in range(BLOCK):
-                    for q in range(m):
-                        x[row[s], a, q] -= l[s, a, b] * x[j, b, q]
+                for q in range(lo, hi):
+                    some |= x[j, a, q] != 0.0
+            if some and runs > 0 and ends[runs - 1] == lo:
+                ends[runs - 1] = hi
+            elif some:
+                begins[runs], ends[runs] = lo, hi
+                runs += 1
+        for r in range(runs):
+            lo, hi = begins[r], ends[r]
+            for a in range(BLOCK):
+                for b in range(a):
+                    for q in range(lo, hi):
+                        x[j, a, q] -= l[d, a, b] * x[j, b, q]
+                for q in range(lo, hi):
+                    x[j, a, q] /= l[d, a, a]
+            for s in range(d + 1, first[j + 1]):
+                for a in range(BLOCK):
+                    for b in range(BLOCK):
+                        for q in range(lo, hi):
+                            x[row[s], a, q] -= l[s, a, b] * x[j, b, q]
+
+
+@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def _backward(first: Any, row: Any, l: Any, x: Any) -> None:  # noqa: E741
+    """Turn right-hand sides x (columns, 6, m) into L^-T x."""
+    n, m = len(first) - 1, x.shape[2]
     for j in range(n - 1, -1, -1):
         d = first[j]
         for s in range(d + 1, first[j + 1]):
@@ -303,11 +327,22 @@ class BlockFactor:
 
     def solve(self, right: Floats) -> Floats:
         """Solutions for right-hand sides (6 columns,) or (6 columns, m)."""
-        position = self.elimination.position
+        return self.backward(self.forward(right))
+
+    def forward(self, right: Floats) -> Floats:
+        """L^-1 of right-hand sides (6 columns,) or (6 columns, m), in the order of elimination."""
+        position, factor = self.elimination.position, self.elimination.factor
         x = np.empty((len(position), BLOCK, right.size // max(BLOCK * len(position), 1)))
         x[position] = right.reshape(x.shape)
-        _solve(self.elimination.factor.first, self.elimination.factor.row, self.blocks, x)
-        return x[position].reshape(right.shape)
+        _forward(factor.first, factor.row, self.blocks, x)
+        return x.reshape(right.shape)
+
+    def backward(self, half: Floats) -> Floats:
+        """Solutions of what `forward` has made of right-hand sides."""
+        position, factor = self.elimination.position, self.elimination.factor
+        x = half.reshape(len(position), BLOCK, half.size // max(BLOCK * len(position), 1)).copy()
+        _backward(factor.first, factor.row, self.blocks, x)
+        return x[position].reshape(half.shape)
 
     def pivots(self) -> Floats:
         """Pivot of every diagonal entry (columns, 6)."""

@@ -5,12 +5,13 @@ With units u and cameras c,
     [ A  B' ] [ du ]     [ gu ]
     [ B  C  ] [ dc ] = - [ gc ]
 
-A couples units that share points: sparse, factorised by blocks. B and C are a border that is as wide as there are
-cameras. With Z = A^-1 B' and z = A^-1 gu
+A couples units that share points: sparse, factorised by blocks into L L'. B and C are a border that is as wide as there
+are cameras. With Y = L^-1 B' and y = L^-1 gu
 
-    (C - B Z) dc = B z - gc          du = -z - Z dc
+    (C - Y' Y) dc = Y' y - gc          du = -L^-T (y + Y dc)
 
-and in the inverse, the units' part is A^-1 + Z (C - B Z)^-1 Z', the cameras' part (C - B Z)^-1.
+and in the inverse, with Z = L^-T Y, the units' part is A^-1 + Z (C - Y' Y)^-1 Z', the cameras' part (C - Y' Y)^-1. Y
+is sparse where cameras are those of many scenes, Z is not: a step goes without it.
 
 Terms may have unknowns of their own that are at their best for every value of the others (a receiver's wandering
 error). These widen the border: they are solved for, have no gradient, and are no part of the reduced vector.
@@ -19,6 +20,7 @@ error). These widen the border: they are solved for, have no gradient, and are n
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -181,13 +183,15 @@ class ReducedCameraSystem:
         if solved is None:
             return None
         step = np.zeros(len(self.gradient))
-        step[:split] = -solved.units_of(self.gradient[:split])
+        half = -solved.factor.forward(self.gradient[:split])
         if solved.cameras is not None:
-            right = np.zeros(len(solved.border))
+            right = np.zeros(solved.half_coupled.shape[1])
             right[: len(solved.free)] = -self.gradient[split:][solved.free]
-            border = scipy.linalg.cho_solve(solved.cameras, right - solved.border @ step[:split], check_finite=False)
+            right -= solved.half_coupled.T @ half
+            border = scipy.linalg.cho_solve(solved.cameras, right, check_finite=False)
             step[split:][solved.free] = border[: len(solved.free)]
-            step[:split] -= solved.coupled @ border
+            half -= solved.half_coupled @ border
+        step[:split] = solved.factor.backward(half)
         return step if np.isfinite(step).all() else None
 
     def eliminate(self, damped: Floats) -> Eliminated | None:
@@ -202,15 +206,15 @@ class ReducedCameraSystem:
         if factor is None:
             return None
         free = np.setdiff1d(np.arange(layout.camera_dof * layout.num_cameras), layout.held() - split)
-        border = np.concatenate([self._border_rows()[free], self.auxiliary.with_units.T])
-        coupled = factor.solve(np.ascontiguousarray(border.T))
+        border = np.concatenate([self._border_rows()[free].T, self.auxiliary.with_units], axis=1)
+        half_coupled = factor.forward(border)
         own = self.cameras[np.ix_(free, free)] + np.diag(damped[split:][free])
-        square = scipy.linalg.block_diag(own, self.auxiliary.square) - border @ coupled
+        square = scipy.linalg.block_diag(own, self.auxiliary.square) - half_coupled.T @ half_coupled
         try:
             cameras = scipy.linalg.cho_factor(square, lower=True, check_finite=False) if len(square) else None
         except np.linalg.LinAlgError:
             return None
-        return Eliminated(factor=factor, free=free, border=border, coupled=coupled, cameras=cameras)
+        return Eliminated(factor=factor, free=free, half_coupled=half_coupled, cameras=cameras)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,9 +223,13 @@ class Eliminated:
 
     factor: BlockFactor
     free: Ints  # (f,) of the cameras' unknowns; after them, the border has those x of the terms
-    border: Floats  # (f + x, 6 units) B
-    coupled: Floats  # (6 units, f + x) A^-1 B'
-    cameras: tuple[Floats, bool] | None  # Cholesky factor of C - B A^-1 B', where the border has unknowns
+    half_coupled: Floats  # (6 units, f + x) Y, in the order in which units are eliminated
+    cameras: tuple[Floats, bool] | None  # Cholesky factor of C - Y' Y, where the border has unknowns
+
+    @cached_property
+    def coupled(self) -> Floats:
+        """A^-1 B' (6 units, f + x): Z."""
+        return self.factor.backward(self.half_coupled)
 
     def units_of(self, right: Floats) -> Floats:
         """A^-1 (6 units,) of a right-hand side."""
@@ -243,12 +251,12 @@ class Eliminated:
         """The border's part (f + x, f + x) of the matrix's inverse, without the long work for the units'."""
         if self.cameras is None:
             return np.zeros((0, 0))
-        return np.asarray(scipy.linalg.cho_solve(self.cameras, np.eye(len(self.border))), dtype=np.float64)
+        return np.asarray(scipy.linalg.cho_solve(self.cameras, np.eye(self.half_coupled.shape[1])), dtype=np.float64)
 
     def inverse(self) -> tuple[Floats, Floats]:
         """Diagonal blocks (units, 6, 6) of the units and the border's part (f + x, f + x) of the matrix's inverse."""
         units, border = self.factor.inverse_diagonal(), self.inverse_of_border()
         if self.cameras is None:
             return units, border
-        coupled = self.coupled.reshape(-1, UNIT_DOF, len(self.border))
+        coupled = self.coupled.reshape(-1, UNIT_DOF, len(border))
         return units + coupled @ border @ np.swapaxes(coupled, 1, 2), border

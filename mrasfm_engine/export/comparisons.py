@@ -93,11 +93,10 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
 def model(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
     """The poses that rigs and frames compose to, cameras, and points, as COLMAP has read them."""
     yield from _rigs_and_cameras(scene, found)
-    centres = np.full((len(scene.unit_registered), len(scene.calibration), 3), np.nan)
     registered = np.flatnonzero(scene.image_registered)
     yield Row("images: the registered ones", sorted(found.images), (registered + 1).tolist())
     yield Row("images: those with a pose", sorted(found.reg_image_ids()), (registered + 1).tolist())
-    counts = np.bincount(scene.observation_image, minlength=len(scene.drive.images))
+    counts, centres = np.bincount(scene.observation_image, minlength=len(scene.drive.images)), []
     for i, pose in zip(registered.tolist(), np.linalg.inv(_registered_poses(scene)), strict=True):
         image, source = found.images[i + 1], scene.drive.images[i]
         described = (image.name, image.camera_id, image.frame_id, image.num_points2D(), image.num_points3D)
@@ -105,8 +104,8 @@ def model(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
         yield Row("images: name, camera, frame, keypoints, observations", described, expected)
         composed = image.cam_from_world().matrix()
         yield Row(f"images: the composed pose of {source.file}", composed, pose[:3], POSE_TOLERANCE)
-        centres[source.unit, source.camera] = -composed[:, :3].T @ composed[:, 3]
-    yield from _baselines(scene, centres)
+        centres.append(-composed[:, :3].T @ composed[:, 3])
+    yield from _baselines(scene, np.reshape(centres, (-1, 3)))
     yield Row("points3D: their number", found.num_points3D(), len(scene.points_m))
     yield Row("points3D: observations", found.compute_num_observations(), len(scene.observation_point))
     yield Row("the model's consistency, as COLMAP finds it,", found.is_valid(), True)
@@ -134,14 +133,30 @@ def _rigs_and_cameras(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
 
 
 def _baselines(scene: Scene, centres: Floats) -> Rows:
-    """The distances of simultaneous cameras (units, cameras, 3): each is the same in every unit."""
+    """The distances of simultaneous cameras of one vehicle: each is the same in every unit.
+
+    Parameters
+    ----------
+    centres
+        (n, 3) of the registered images.
+    """
     if scene.unit_from_image is not None:
         return
-    for a, b in combinations(range(centres.shape[1]), 2):
-        lengths = np.linalg.norm(centres[:, a] - centres[:, b], axis=1)
-        lengths = lengths[np.isfinite(lengths)]
-        if len(lengths):
-            yield Row(f"rigs: the distance of cameras {a} and {b}", float(np.ptp(lengths)), 0.0, POSE_TOLERANCE)
+    registered = np.flatnonzero(scene.image_registered)
+    unit, camera = (np.array([getattr(scene.drive.images[i], name) for i in registered]) for name in ("unit", "camera"))
+    vehicle = scene.rig_of_camera[camera] if len(camera) else np.zeros(0, np.int64)
+    order = np.argsort(vehicle, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(vehicle[order])) + 1):
+        cameras, of_camera = np.unique(camera[own], return_inverse=True)
+        units, of_unit = np.unique(unit[own], return_inverse=True)
+        places = np.full((len(units), len(cameras), 3), np.nan)
+        places[of_unit, of_camera] = centres[own]
+        for a, b in combinations(range(len(cameras)), 2):
+            lengths = np.linalg.norm(places[:, a] - places[:, b], axis=1)
+            lengths = lengths[np.isfinite(lengths)]
+            if len(lengths):
+                what = f"rigs: the distance of cameras {cameras[a]} and {cameras[b]}"
+                yield Row(what, float(np.ptp(lengths)), 0.0, POSE_TOLERANCE)
 
 
 def points_text(scene: Scene, found: Iterator[ModelPoints]) -> Rows:

@@ -46,9 +46,9 @@ def view_document(
     document
         `map.json` of a map.
     """
-    names = list(dict.fromkeys(scene_of_unit))
+    images_of, poses = _images_of_scenes(scene, scene_of_unit), scene.world_from_cam
     is_map, epsg = document is not None, epsg_code_of(scene)
-    tracks = {name: _track(scene, scene_of_unit, name) for name in names}
+    tracks = _tracks(scene, scene_of_unit)
     return {
         "version": 1,
         **({} if epsg is None else {"epsg": epsg, "heights": "ellipsoidal"}),
@@ -60,11 +60,11 @@ def view_document(
                 "name": name,
                 "color": COLORS[number % len(COLORS)],
                 **_trajectory(scene, tracks[name]),
-                "images": list(_images(scene, scene_of_unit, name, places, prefix=f"{name}/" if is_map else "")),
+                "images": list(_images(scene, poses, images_of[name], places, prefix=f"{name}/" if is_map else "")),
             }
-            for number, name in enumerate(names)
+            for number, name in enumerate(tracks)
         ],
-        "seams": [] if document is None else list(_seams(scene, scene_of_unit, document)),
+        "seams": [] if document is None else list(_seams(scene, tracks, document)),
     }
 
 
@@ -91,11 +91,21 @@ def _relative(scene: Scene, points_m: Floats) -> list[list[float]]:
     return found
 
 
-def _track(scene: Scene, scene_of_unit: Sequence[str], name: str) -> Ints:
-    """Registered units of a scene in order of time."""
-    mine = np.array([own == name for own in scene_of_unit], dtype=np.bool_)
-    units = np.flatnonzero(scene.unit_registered & mine)
-    return units[np.argsort(scene.drive.timestamps_us[units], kind="stable")]
+def _tracks(scene: Scene, scene_of_unit: Sequence[str]) -> dict[str, Ints]:
+    """Registered units of every scene in order of time."""
+    found: dict[str, list[int]] = {name: [] for name in scene_of_unit}
+    for unit in np.argsort(scene.drive.timestamps_us, kind="stable").tolist():
+        if scene.unit_registered[unit]:
+            found[scene_of_unit[unit]].append(unit)
+    return {name: np.array(units, dtype=np.int64) for name, units in found.items()}
+
+
+def _images_of_scenes(scene: Scene, scene_of_unit: Sequence[str]) -> dict[str, list[int]]:
+    """Registered images of every scene."""
+    found: dict[str, list[int]] = {name: [] for name in scene_of_unit}
+    for index in np.flatnonzero(scene.image_registered).tolist():
+        found[scene_of_unit[scene.drive.images[index].unit]].append(index)
+    return found
 
 
 def _trajectory(scene: Scene, units: Ints) -> dict[str, Any]:
@@ -108,14 +118,12 @@ def _trajectory(scene: Scene, units: Ints) -> dict[str, Any]:
 
 
 def _images(
-    scene: Scene, scene_of_unit: Sequence[str], name: str, places: Mapping[int, tuple[int, int]], *, prefix: str
+    scene: Scene, poses: Floats, images: Sequence[int], places: Mapping[int, tuple[int, int]], *, prefix: str
 ) -> Iterator[dict[str, Any]]:
-    poses, corners = scene.world_from_cam, [_corners(scene, camera) for camera in range(len(scene.drive.cameras))]
-    for index in np.flatnonzero(scene.image_registered).tolist():
-        image = scene.drive.images[index]
-        if scene_of_unit[image.unit] != name:
-            continue
-        pose = poses[index]
+    numbers = sorted({scene.drive.images[index].camera for index in images})
+    corners = {number: _corners(scene, number) for number in numbers}
+    for index in images:
+        image, pose = scene.drive.images[index], poses[index]
         camera = scene.drive.cameras[image.camera]
         yield {
             "file": image.file.removeprefix(prefix),
@@ -141,13 +149,13 @@ def _corners(scene: Scene, camera: int) -> Floats:
     return np.vstack([np.zeros((1, 3)), flat * FRUSTUM_M])
 
 
-def _seams(scene: Scene, scene_of_unit: Sequence[str], document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _seams(scene: Scene, tracks: Mapping[str, Ints], document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Seams as lines between the units of both scenes that are nearest to each other."""
     for seam in document["seams"]:
-        tracks = [_track(scene, scene_of_unit, seam[side]) for side in ("a", "b")]
+        own = [tracks[seam[side]] for side in ("a", "b")]
         shown: dict[str, Any] = {"a": seam["a"], "b": seam["b"], "accepted": bool(seam["accepted"])}
-        if all(len(track) for track in tracks):
-            a, b = (scene.world_from_rig[track][:, :3, 3] for track in tracks)
+        if all(len(track) for track in own):
+            a, b = (scene.world_from_rig[track][:, :3, 3] for track in own)
             distance_m, nearest = map(np.asarray, cKDTree(b).query(a))
             closest = int(np.argmin(distance_m))
             shown["line_m"] = _relative(scene, np.stack([a[closest], b[nearest[closest]]]))

@@ -53,6 +53,24 @@ def test_solutions_and_inverse(columns: int, band: int, loops: int) -> None:
     np.testing.assert_allclose(factor.inverse_diagonal(), expected, rtol=1e-9, atol=1e-13)
 
 
+@pytest.mark.parametrize(("columns", "band", "loops"), CHAINS)
+def test_right_hand_sides_that_most_columns_know_nothing_of(columns: int, band: int, loops: int) -> None:
+    pattern, blocks = chain(columns, band, loops)
+    factor = BlockFactor.from_blocks(Elimination.from_pattern(pattern), blocks)
+    assert factor is not None
+    rng = np.random.default_rng(2)
+    right = np.zeros((columns, BLOCK, 45))
+    for first in range(0, 45, 5):
+        right[rng.integers(columns), :, first : first + 5] = rng.normal(size=(BLOCK, 5))
+    right = right.reshape(BLOCK * columns, 45)
+    right[:, 20:30] = 0.0
+    found = factor.solve(right)
+    np.testing.assert_allclose(found, np.linalg.solve(dense(pattern, blocks), right), rtol=1e-9, atol=1e-13)
+    half = factor.forward(right)
+    assert not half[:, 20:30].any()
+    np.testing.assert_allclose(half.T @ half, right.T @ found, rtol=1e-9, atol=1e-13)
+
+
 def test_only_the_lower_triangle_of_diagonal_blocks_is_read() -> None:
     pattern, blocks = chain(10, 2, 3)
     order = Elimination.from_pattern(pattern)

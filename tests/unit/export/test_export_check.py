@@ -156,14 +156,18 @@ def test_a_file_that_no_check_covers_is_refused(scene: Scene, tmp_path: Path, mo
 
 
 def test_cameras_whose_distance_changes_are_refused(scene: Scene) -> None:
-    units, cameras = len(scene.unit_registered), len(scene.calibration)
+    registered = [image for image, is_known in zip(scene.drive.images, scene.image_registered, strict=True) if is_known]
     rng = np.random.default_rng(0)
-    rig = rng.normal(size=(cameras, 3))
-    centres = rig + rng.normal(size=(units, 1, 3))
-    centres[1] = np.nan
-    assert all(row.agrees for row in comparisons._baselines(scene, centres))
-    centres[2, 0] += 5e-6 * (rig[0] - rig[1]) / np.linalg.norm(rig[0] - rig[1])
+    rig = rng.normal(size=(len(scene.calibration), 3))
+    of_unit = rng.normal(size=(len(scene.unit_registered), 3))
+    centres = np.array([rig[image.camera] + of_unit[image.unit] for image in registered])
+    (row,) = comparisons._baselines(scene, centres)
+    assert row.agrees
+    moved = next(n for n, image in enumerate(registered) if (image.unit, image.camera) == (2, 0))
+    centres[moved] += 5e-6 * (rig[0] - rig[1]) / np.linalg.norm(rig[0] - rig[1])
     (row,) = comparisons._baselines(scene, centres)
     assert not row.agrees
     moving = replace(scene, unit_from_image=np.tile(np.eye(4), (len(scene.drive.images), 1, 1)))
     assert not list(comparisons._baselines(moving, centres))
+    # Two vehicles are not one rig, however they move against each other.
+    assert not list(comparisons._baselines(replace(scene, rig_of_camera=np.array([0, 1])), centres))
