@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -34,6 +35,10 @@ from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
 POINT_STEPS = 2  # steps of points whose poses have moved
 MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
+# Steps are lengthened where two have one direction in most of what they do: by their cosine, which is above one where
+# damping or weights have changed the metric between them, and much above where there is nothing to compare.
+COSINES = (0.7, 1.05)
+MAX_RATE = 7.0 / 8.0  # of one step's length to that before: of rates near one, two steps tell little
 
 
 class Termination(StrEnum):
@@ -269,6 +274,13 @@ class Problem:
         )  # fmt: skip
         return out
 
+    def after(
+        self, state: State, costs: Floats, system: ReducedCameraSystem, step: Floats
+    ) -> tuple[State, Floats, float]:
+        """The state after a step (n,) of the reduced vector, with its points' costs (p,) and that of all."""
+        result = self.retract(state, step, self.points_after(state, system, step))
+        return result, *self.refine_points(result, state, costs)
+
     def scores(self, state: State, system: ReducedCameraSystem, columns: Floats, group: Ints) -> Floats:
         """Sums (groups, k) of J' w r over the observations of each group, along k steps of everything but points.
 
@@ -316,6 +328,12 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     Notes
     -----
     Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
+
+    The normal equations have the weights of the robust loss without its curvature, so that they take the cost for
+    steeper than it is: near the minimum every step goes along the one before and is shorter by one factor. Every other
+    step is lengthened by what the rest of that geometric series adds to it, and taken as it is where that costs more
+    [Aitken's extrapolation of vectors: Ramiere and Helfer, Iterative residual-based vector methods to accelerate fixed
+    point iterations, Computers and Mathematics with Applications 2015].
     """
     if problem.layout.size < SMALL_SYSTEM:
         with _THREADS.limit(limits=1, user_api="blas"):
@@ -331,6 +349,24 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     return state, report
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Direction:
+    """Direction of a step that was taken as it is, by its products with other steps."""
+
+    gradient: Floats  # (n,) from which it came
+    decrement: float
+
+    def factor_of(self, step: Floats, decrement: float) -> float:
+        """Factor by which to lengthen the step (n,) that follows, so that no more of its kind need to."""
+        if not (self.decrement > 0.0 and decrement > 0.0):
+            return 1.0
+        along = -float(step @ self.gradient)
+        low, high = COSINES
+        if not low < along / math.sqrt(self.decrement * decrement) < high:
+            return 1.0
+        return 1.0 / (1.0 - min(along / self.decrement, MAX_RATE))
+
+
 def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     options, state = problem.options, problem.state
     costs = problem.point_costs(state)
@@ -340,23 +376,30 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     free = problem.unknowns
     if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
+    before: _Direction | None = None
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
         iterations += 1
         system = problem.normal_equations(state, damping)
         step = problem.step(state, system, damping)
+        decrement = 0.0 if step is None else -float(step @ system.gradient)
         if step is not None:
-            trial = problem.retract(state, step, problem.points_after(state, system, step))
-            trial_costs, trial_cost = problem.refine_points(trial, state, costs)
+            direction = _Direction(gradient=system.gradient, decrement=decrement)
+            factor = 1.0 if before is None else before.factor_of(step, decrement)
+            trial, trial_costs, trial_cost = problem.after(state, costs, system, factor * step)
+            if factor > 1.0 and not trial_cost < cost:
+                factor = 1.0
+                trial, trial_costs, trial_cost = problem.after(state, costs, system, step)
+            before = direction if factor == 1.0 else None
         if step is None or not trial_cost < cost:
+            before = None
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
             elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        decrement = -float(step @ system.gradient)
         if cost - trial_cost <= options.function_tolerance * cost or (
             # A step that damping holds back is short wherever the minimum is.
             free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mrasfm_engine.bundle_adjustment import solver
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
@@ -60,6 +61,49 @@ def test_a_step_that_is_short_for_its_damping_is_no_convergence() -> None:
     solution, report = solve(replace(case.problem, state=start, options=slow))
     assert report.termination is Termination.CONVERGED
     assert 0 < position_errors_m(solution, best).max() < 1e-3
+
+
+def test_lengthened_steps_come_to_the_same_minimum_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Errors beyond the scale of the loss, as in real images: there it is far less steep than its weights say.
+    case = drive(noise_px=2.0)
+    start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
+    options = SolverOptions(function_tolerance=0.0, decrement_tolerance=1e-4, max_iterations=100)
+    problem = replace(case.problem, state=start, options=options)
+    solution, report = solve(problem)
+    monkeypatch.setattr(solver, "COSINES", (2.0, 3.0))
+    as_they_are, slower = solve(problem)
+    assert report.termination is slower.termination is Termination.CONVERGED
+    assert report.iterations <= 0.8 * slower.iterations
+    np.testing.assert_allclose(report.final_cost, slower.final_cost, rtol=1e-4)  # points are between their weights
+    assert 0 < position_errors_m(solution, as_they_are).max() < 0.05 * position_errors_m(solution, case.truth).max()
+
+
+def test_a_step_is_lengthened_by_the_rest_of_its_series() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    information = root @ root.T
+    first = rng.normal(size=6)
+    before = solver._Direction(gradient=-information @ first, decrement=float(first @ information @ first))
+
+    def factor(step: np.ndarray) -> float:
+        return before.factor_of(step, float(step @ information @ step))
+
+    np.testing.assert_allclose(factor(0.6 * first), 2.5)  # 1 + 0.6 + 0.36 + ...
+    np.testing.assert_allclose(factor(1.3 * first), 8.0)  # no series that ends
+    assert factor(-0.6 * first) == 1.0
+    other = rng.normal(size=6)
+    other -= first * float(other @ information @ first) / before.decrement
+    assert factor(other) == 1.0
+
+
+def test_a_lengthened_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = drive(noise_px=0.5)
+    start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
+    plain, _ = solve(replace(case.problem, state=start))
+    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: 100.0)
+    solution, report = solve(replace(case.problem, state=start))
+    assert report.termination is Termination.CONVERGED
+    assert position_errors_m(solution, plain).max() < 1e-3
 
 
 @pytest.mark.parametrize("outlier_fraction", [0.0, 0.1])
