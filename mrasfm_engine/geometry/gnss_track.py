@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,8 +33,10 @@ class GnssTrack:
     timestamps_us: Ints  # (n,)
     position_m: Floats  # (n, 3)
     sigma_m: Floats  # (n, 3)
-    good: Bools  # (n,) False for gross errors
+    good: Bools  # (n,) False for gross errors and what is held
     swapped_from_local: Floats | None = None
+    # (n,) repetitions of the position before, which are no good ones either; empty where nobody looked for them
+    held: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def at(self, timestamps_us: Ints, *, max_gap_us: int) -> tuple[Floats, Floats]:
         """Positions and sigmas (m, 3) at other times, linear between good samples; NaN outside and in larger gaps."""

@@ -89,7 +89,8 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
     position = geodesy.local_from_geodetic(geodetic, ecef_from_local)
     sigma = np.array([(s.sigma_horizontal_m, s.sigma_horizontal_m, s.sigma_vertical_m) for s in gnss.samples])
     times = np.array([s.timestamp_us for s in gnss.samples], dtype=np.int64)
-    good = ~find_held(times, position, sigma)
+    held = find_held(times, position, sigma)
+    good = ~held
     bad = find_gross_errors(times[good], position[good], sigma[good], outlier_sigmas=config.outlier_sigmas)
     good[good] = ~bad
     return (
@@ -98,6 +99,7 @@ def _track(drive: Drive, config: GnssConfig) -> tuple[GnssTrack, Georeference]:
             position_m=position,
             sigma_m=sigma,
             good=good,
+            held=held,
             swapped_from_local=_swapped_from_local(float(origin[0]), float(origin[1])),
         ),
         Georeference(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.extraction import extract_features
+from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.preflight.drive_check import require_sound
@@ -11,7 +14,7 @@ from mrasfm_engine.preflight.image_content import inspect_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.stages._run import Run
 from schemas.artifacts import PLAN_CHECKPOINTS, Stage
-from schemas.findings import as_json
+from schemas.findings import Finding, as_json, warning
 
 PROBE_UNITS = 5
 
@@ -35,12 +38,34 @@ def preflight(run: Run) -> None:
 def prior(run: Run) -> PriorTrajectory:
     """Read the prior trajectory of the units."""
     result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
+    track = result.gnss
     run.report["prior"] = {
         "source": result.source,
-        "gnss_samples": 0 if result.gnss is None else len(result.gnss.good),
-        "gnss_gross_errors": 0 if result.gnss is None else int((~result.gnss.good).sum()),
+        "gnss_samples": 0 if track is None else len(track.good),
+        "gnss_gross_errors": 0 if track is None else int((~track.good & ~track.held).sum()),
+        "gnss_held": 0 if track is None else int(track.held.sum()),
     }
+    run.report["findings"] += [] if track is None else [as_json(finding) for finding in held_findings(track)]
     return result
+
+
+def held_findings(track: GnssTrack) -> list[Finding]:
+    """The finding that a receiver, or who logs it, repeats positions while the vehicle drives on."""
+    if not track.held.any():
+        return []
+    last_own = np.maximum.accumulate(np.where(track.held, 0, np.arange(len(track.held))))
+    held_us = track.timestamps_us - track.timestamps_us[last_own]
+    longest = int(np.argmax(held_us))
+    return [
+        warning(
+            "gnss-held",
+            f"{int(track.held.sum())} of {len(track.held)} gnss.samples repeat the position before them while the "
+            f"vehicle drives on, for up to {held_us[longest] / 1e6:.1f} s after "
+            f"{track.timestamps_us[last_own[longest]]} us",
+            "Nothing needs to be done: they are left out. Where this is long the receiver had no fix, or its log "
+            "stopped.",
+        )
+    ]
 
 
 def probe(run: Run) -> None:
