@@ -1,9 +1,10 @@
 """Simultaneous images that contradict the calibration by more than a correction explains: images of another time, or a
 camera that is turned.
 
-Both are usual mistakes of recordings: the files of a camera begin a frame late, or an image is turned by a right angle
-and its camera in the rig is not. Where cameras have a common view, their matches show it. A drive of this kind is
-refused with what was found: whatever is made of it hangs on a rig that the car does not have.
+Both are usual mistakes of recordings: the files of a camera begin a frame late, or lack one from somewhere on, or an
+image is turned by a right angle and its camera in the rig is not. Where cameras have a common view, their matches show
+it. A drive of this kind is refused with what was found: whatever is made of it hangs on a rig that the car does not
+have.
 """
 
 from __future__ import annotations
@@ -32,10 +33,10 @@ from mrasfm_engine.matching.simultaneous import are_simultaneous, calibration_si
 from mrasfm_engine.matching.verification import essential_inliers, relative_pose
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.types import Bools, Cancel, Floats
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
-MIN_UNITS = 3  # in which two cameras contradict the calibration
-SAMPLED_UNITS = 8
+MIN_UNITS = 3  # one after the other, in which two cameras contradict the calibration
+COMPARED_UNITS, SEARCHED_UNITS = 64, 8
 MAX_LAG = 5  # frames that images may be late
 LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
 STEADY_TURN_DEG = 1.0
@@ -47,10 +48,31 @@ DRAWN_PX, DRAWN_SHARE = 1.5, 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class _Comparison:
-    """Some units of two cameras, and the share of their matches that fits the calibration in most of these."""
+    """Units (n,) of two cameras, and the share (n,) of their matches that fits the rig as given or as corrected."""
 
-    units: list[int]
-    share: float
+    units: Ints
+    shares: Floats
+
+    @property
+    def share(self) -> float:
+        """The usual share."""
+        return float(np.median(self.shares))
+
+    def contradicting(self) -> _Comparison | None:
+        """The longest run of units that contradict the rig; all units, where those that do so are among others."""
+        low = np.concatenate([[False], self.shares < CLEARLY_BETTER, [False]])
+        begins, ends = (np.flatnonzero(np.diff(low.astype(np.int8)) == step) for step in (1, -1))
+        longest = int(np.argmax(ends - begins)) if len(begins) else 0
+        if len(begins) and ends[longest] - begins[longest] >= MIN_UNITS:
+            return self._at(np.arange(begins[longest], ends[longest]))
+        return self if self.share < CLEARLY_BETTER else None
+
+    def evenly(self, count: int) -> _Comparison:
+        """At most so many of them, all along."""
+        return self._at(_evenly(len(self.units), count))
+
+    def _at(self, rows: Ints) -> _Comparison:
+        return _Comparison(units=self.units[rows], shares=self.shares[rows])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +102,9 @@ def require_images_as_listed(
 ) -> None:
     """Refuse a drive one of whose cameras is late by whole frames, or turned by far more than it could be by chance.
 
-    Cameras whose simultaneous images mostly fit the calibration as given, or as corrected by all of them, cost next to
-    nothing. Of others some units are matched anew, each image of one camera with those of the other that were taken up
-    to `MAX_LAG` frames before and after it.
+    Cameras whose simultaneous images fit the calibration as given, or as corrected by all of them, cost next to
+    nothing. Where they do not, all along or in units that follow one another, some of these units are matched anew,
+    each image of one camera with those of the other that were taken up to `MAX_LAG` frames before and after it.
 
     Parameters
     ----------
@@ -100,12 +122,12 @@ def require_images_as_listed(
     """
     rigs = [drive.rig_from_cam, *([] if rig_from_cam is None else [rig_from_cam])]
     compared = _compared(drive, features, pairs, rigs, config)
-    contradicted = {cameras: found for cameras, found in compared.items() if found.share < CLEARLY_BETTER}
+    contradicted = {cameras: run for cameras, found in compared.items() if (run := found.contradicting()) is not None}
     if not contradicted:
         return
     searches = {
-        cameras: _Search(drive, features, matcher, config, cameras, found, cancel)
-        for cameras, found in contradicted.items()
+        cameras: _Search(drive, features, matcher, config, cameras, run.evenly(SEARCHED_UNITS), cancel)
+        for cameras, run in contradicted.items()
     }
     with threadpool_limits(1, "blas"):
         turns_deg = {cameras: search.turn_deg() for cameras, search in searches.items()}
@@ -117,11 +139,12 @@ def require_images_as_listed(
         }
         if lags:
             agree = {camera for cameras in compared.keys() - contradicted.keys() for camera in cameras}
-            raise _late(drive, lags, agree)
+            spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
+            raise _late(drive, lags, agree, spans)
         sigma_deg = np.degrees(calibration_sigmas(drive, calibration)[0])
-        for cameras, found in contradicted.items():
+        for cameras in contradicted:
             least_deg = max(MIN_TURN_DEG, TURN_SIGMAS * float(np.hypot(*sigma_deg[list(cameras)])))
-            if found.share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
+            if compared[cameras].share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
                 raise _turned(drive, cameras, turns_deg[cameras])
 
 
@@ -143,7 +166,7 @@ def _compared(
     result = {}
     for (a, b), found in sorted(by_cameras.items()):
         shares, units, gate = [], [], PAIR_ERROR_PX / float(focal_px[[a, b]].min())
-        for pair in _evenly(found):
+        for pair in (found[k] for k in _evenly(len(found), COMPARED_UNITS)):
             rays_a, rays_b = (
                 unproject_pixels(int(kinds[camera]), params[camera], features[image].xy_px[rows])
                 for camera, image, rows in zip((a, b), (pair.image_a, pair.image_b), pair.matches.T, strict=True)
@@ -156,13 +179,24 @@ def _compared(
                 shares.append([share_explained(rig[a], rig[b], rays_a[kept], rays_b[kept], gate) for rig in rigs])
                 units.append(drive.images[pair.image_a].unit)
         if len(shares) >= MIN_UNITS:
-            result[a, b] = _Comparison(units=units, share=float(np.median(shares, axis=0).max()))
+            of_rig = np.array(shares).T
+            best = int(np.argmax(np.median(of_rig, axis=1)))
+            result[a, b] = _Comparison(units=np.array(units, dtype=np.int64), shares=of_rig[best])
     return result
 
 
-def _evenly(found: Sequence[PairMatches]) -> list[PairMatches]:
-    chosen = np.linspace(0, len(found) - 1, min(SAMPLED_UNITS, len(found))).round().astype(int)
-    return [found[k] for k in chosen]
+def _evenly(total: int, count: int) -> Ints:
+    """At most so many places of a list of that length, all along it."""
+    return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)
+
+
+def _span(drive: Drive, compared: _Comparison, run: _Comparison) -> str:
+    """Time of a run among all units that were compared, in words; nothing where it is all of it."""
+    first_us, last_us = drive.timestamps_us[run.units[[0, -1]]]
+    begins, ends = run.units[[0, -1]] != compared.units[[0, -1]]
+    if begins:
+        return f" from {first_us} us {f'to {last_us} us' if ends else 'on'}"
+    return f" until {last_us} us" if ends else ""
 
 
 class _Search:
@@ -187,7 +221,7 @@ class _Search:
         # By unit: an image is prepared once.
         self._pairs = [
             (lag, where[u, cameras[0]], where[u + lag, cameras[1]])
-            for u in listed.units
+            for u in listed.units.tolist()
             for lag in range(-MAX_LAG, MAX_LAG + 1)
             if (u, cameras[0]) in where and (u + lag, cameras[1]) in where
         ]
@@ -268,7 +302,9 @@ def _common_rotation(rays_a: Sequence[Floats], rays_b: Sequence[Floats], max_err
     return None if pose is None else pose[0]
 
 
-def _late(drive: Drive, lags: dict[tuple[int, int], int], agree: set[int]) -> InputError:
+def _late(
+    drive: Drive, lags: dict[tuple[int, int], int], agree: set[int], spans: dict[tuple[int, int], str]
+) -> InputError:
     """The error, with those cameras that may be late: the ones that agree with none."""
     names = [camera.name for camera in drive.cameras]
     late = sorted({camera for cameras in lags for camera in cameras} - agree)
@@ -277,13 +313,14 @@ def _late(drive: Drive, lags: dict[tuple[int, int], int], agree: set[int]) -> In
         late = sorted(camera for camera in late if counts[camera] == max(counts.values()))
     late = late or sorted({camera for cameras in lags for camera in cameras})
     (a, b), lag = next(((pair, lag) for pair, lag in lags.items() if set(pair) & set(late)), next(iter(lags.items())))
+    span = spans[a, b]
     frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
     when = "before" if lag > 0 else "after"
     return InputError(
-        f"frames: images of {names[b]} fit rig.cameras with those of {names[a]} that are listed {frames} {when} them, "
-        "and not with those of their own frame",
-        remedy=f"Move the images of {' or '.join(names[camera] for camera in late)} by {frames}, so that every frame "
-        "has images of one time. If they are of one time, check rig_from_cam of these cameras.",
+        f"frames: images of {names[b]} fit rig.cameras with those of {names[a]} that are listed {frames} {when} them"
+        f"{span}, and not with those of their own frame",
+        remedy=f"Move the images of {' or '.join(names[camera] for camera in late)} by {frames}{span}, so that every "
+        "frame has images of one time. If they are of one time, check rig_from_cam of these cameras.",
         code="camera-late",
     )
 

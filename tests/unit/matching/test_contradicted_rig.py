@@ -65,12 +65,14 @@ def street(
     cameras: int = 2,
     late: int | None = None,
     lag: int = 0,
+    late_units: range = range(UNITS),
     given: np.ndarray | None = None,
     speed_m: float = 1.2,
     turn_deg: float = 1.7,
     steady: bool = False,
 ) -> Street:
-    """Images of a street; those of the camera `late` were taken `lag` frames before the ones they are listed with."""
+    """Images of a street; those of the camera `late` were taken `lag` frames before the ones they are listed with,
+    in some units."""
     rng = np.random.default_rng(0)
     true = looking_ahead(cameras)
     params = np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * cameras)
@@ -79,7 +81,7 @@ def street(
     points = np.stack([rng.uniform(-10, 60, POINTS), side * rng.uniform(4, 12, POINTS), rng.uniform(-1, 8, POINTS)], 1)
     descriptors, features = random_descriptors(POINTS, rng), []
     for image in drive.images:
-        unit = image.unit - (lag if image.camera == late else 0)
+        unit = image.unit - (lag if image.camera == late and image.unit in late_units else 0)
         # It turns, and not always by as much: else a lag looks like a camera that is mounted otherwise.
         heading = np.radians(turn_deg) * (unit + (0.0 if steady else 2.0 * np.sin(0.9 * unit)))
         vehicle = se3.transform(se3.exp_so3([0.0, 0.0, heading]), [speed_m * unit, 0.5 * speed_m * heading * unit, 0.0])
@@ -117,6 +119,32 @@ def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag:
     frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
     assert f"listed {frames} {'before' if lag > 0 else 'after'} them" in caught.value.what
     assert frames in caught.value.remedy
+
+
+@pytest.mark.parametrize(
+    ("late_units", "span"),
+    [
+        (range(5, UNITS), "from {5} us on"),
+        (range(7, UNITS), "from {7} us on"),
+        (range(4), "until {3} us"),
+        (range(4, 8), "from {4} us to {7} us"),
+    ],
+)
+@pytest.mark.parametrize("lag", [1, -1])
+def test_a_camera_that_is_late_from_somewhere_on_is_refused_with_the_time(
+    late_units: range, span: str, lag: int
+) -> None:
+    made = street(late=1, lag=lag, late_units=late_units, speed_m=2.0)
+    with pytest.raises(InputError) as caught:
+        made.check()
+    assert caught.value.code == "camera-late"
+    at = span.format(*made.drive.timestamps_us)
+    assert f"listed 1 frame {'before' if lag > 0 else 'after'} them {at}, and not" in caught.value.what
+    assert f"by 1 frame {at}, so that" in caught.value.remedy
+
+
+def test_one_frame_that_is_late_is_left_to_the_mapping() -> None:
+    street(late=1, lag=1, late_units=range(6, 8)).check()
 
 
 def test_of_three_cameras_the_late_one_is_named() -> None:
