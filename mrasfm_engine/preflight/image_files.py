@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+
+import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
@@ -34,7 +37,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         Called with how many of how many images are checked.
     """
     findings: list[Finding] = []
-    paths = _PathCheck(drive.root)
+    paths, repeats = _PathCheck(drive.root), _Repeats(drive)
     oddities: dict[str, list[str]] = {code: [] for code in _GROUPED}
     # One mask may serve many images, as that of the own car's body.
     masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
@@ -46,6 +49,8 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         findings += found_here
         for code in codes:
             oddities[code].append(image.file)
+        if not found_here:
+            repeats.look_at(image)
         if progress is not None:
             progress(done, total)
     with ThreadPoolExecutor(MASK_THREADS) as pool:
@@ -57,7 +62,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         if oddities[code]:
             files = oddities[code]
             findings.append(warning(code, f"{len(files)} images {state}: {listed(files)}", remedy))
-    return [*_gather(findings), *_unlisted(drive)]
+    return [*_gather(findings), *repeats.findings(), *_unlisted(drive)]
 
 
 class _PathCheck:
@@ -83,6 +88,38 @@ class _PathCheck:
             return path.resolve().is_relative_to(self._root)
         except (OSError, RuntimeError):  # links in a circle
             return False
+
+
+class _Repeats:
+    """Images that are the same files as those before them: no camera makes the same image twice, whatever it sees."""
+
+    def __init__(self, drive: Drive) -> None:
+        self._drive = drive
+        self._before: dict[int, tuple[DriveImage, int]] = {}  # by camera, with its size in bytes
+        self._repeated: dict[int, list[DriveImage]] = {}
+
+    def look_at(self, image: DriveImage) -> None:
+        """Compare an image with the one before it of its camera; they come in the order of time."""
+        path = self._drive.root / image.file
+        before, size = self._before.get(image.camera), path.stat().st_size
+        self._before[image.camera] = image, size
+        if before is None or before[1] != size:  # as nearly always
+            return
+        if filecmp.cmp(self._drive.root / before[0].file, path, shallow=False):
+            self._repeated.setdefault(image.camera, []).append(image)
+
+    def findings(self) -> Iterator[Finding]:
+        """One of each camera that has any."""
+        for camera, images in sorted(self._repeated.items()):
+            units = np.array([image.unit for image in images])
+            most = max(len(run) for run in np.split(units, np.flatnonzero(np.diff(units) > 1) + 1))
+            yield warning(
+                "repeated-images",
+                f"{len(images)} images of camera {self._drive.cameras[camera].name} are copies of the one before them, "
+                f"up to {most} in a row: {listed([image.file for image in images])}",
+                "Take them out of drive.json unless the vehicle stood: they show where it was before. The camera or "
+                "what records it repeats its last image when it gets no new one.",
+            )
 
 
 def _check_image(drive: Drive, image: DriveImage, paths: _PathCheck) -> tuple[list[Finding], list[str]]:

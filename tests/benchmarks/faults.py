@@ -46,6 +46,7 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         yield exactly("18", f"kitti06, {title}: the finding {finding}", int(found), 1)
     for title, edit, said in (
         ("a camera one frame late", _late, "listed 1 frame before them"),
+        ("a camera without one of its frames", _without_a_frame, "listed 1 frame after them from 2500000 us on"),
         ("a camera upside down", _upside_down, "turned by 180 deg against each other"),
     ):
         refused = edited(drive, work / f"kitti06, {title}, drive", [edit])
@@ -106,6 +107,16 @@ def _late(manifest: dict[str, Any]) -> None:
     for frame, before in zip(manifest["frames"][1:], files[:-1], strict=True):
         frame["images"][LATE] = before
     del manifest["frames"][0]["images"][LATE]
+
+
+def _without_a_frame(manifest: dict[str, Any]) -> None:
+    """A camera lost a frame in the middle: those after it are listed a frame early, and the last frame has none."""
+    frames = manifest["frames"]
+    middle = len(frames) // 2
+    files = [frame["images"][LATE] for frame in frames]
+    for frame, after in zip(frames[middle:-1], files[middle + 1 :], strict=True):
+        frame["images"][LATE] = after
+    del frames[-1]["images"][LATE]
 
 
 def _upside_down(manifest: dict[str, Any]) -> None:

@@ -89,6 +89,19 @@ def test_unlisted_images(drive_document: Document, write_drive: WriteDrive) -> N
     assert "images/left/extra0.JPG" in finding.what
 
 
+def test_images_that_are_copies_of_the_one_before(drive_document: Document, write_drive: WriteDrive) -> None:
+    root = write_drive(drive_document)
+    images = root / "images/left"
+    for copy, original in ((2, 1), (3, 1)):
+        (images / f"00000{copy}.png").write_bytes((images / f"00000{original}.png").read_bytes())
+    # Of another camera, and of other frames than the one before, they are no repetition.
+    (root / "images/right/000000.png").write_bytes((images / "000000.png").read_bytes())
+    (root / "images/right/000004.png").write_bytes((root / "images/right/000002.png").read_bytes())
+    finding = only(root, "repeated-images", Severity.WARNING)
+    assert "2 images of camera left are copies of the one before them, up to 2 in a row" in finding.what
+    assert "images/left/000002.png, images/left/000003.png" in finding.what
+
+
 def test_links_out_of_the_drive(drive_document: Document, write_drive: WriteDrive, tmp_path: Path) -> None:
     root = write_drive(drive_document)
     outside = tmp_path / "outside.png"
@@ -153,7 +166,7 @@ def test_turned_image(drive_document: Document, write_drive: WriteDrive) -> None
 def test_unusual_pixels_are_warned_of_once(drive_document: Document, write_drive: WriteDrive) -> None:
     root = write_drive(drive_document)
     for i in range(2):
-        cv2.imwrite(str(root / f"images/left/{i:06d}.png"), np.zeros((32, 48, 4), np.uint16))
+        cv2.imwrite(str(root / f"images/left/{i:06d}.png"), np.full((32, 48, 4), i, np.uint16))
     found = findings(root)
     assert sorted(found) == ["16-bit-image", "alpha-channel"]
     for group in found.values():
