@@ -56,7 +56,12 @@ class Observability:
 
 
 def assess_directions(
-    covariance: Floats, *, position_m: Floats, sigma_rotation_rad: Floats, sigma_translation_m: Floats
+    covariance: Floats,
+    *,
+    position_m: Floats,
+    sigma_rotation_rad: Floats,
+    sigma_translation_m: Floats,
+    weight: Floats | None = None,
 ) -> Observability:
     """Compare the posterior of all cameras' poses with their prior.
 
@@ -69,6 +74,9 @@ def assess_directions(
         Places (c, 3) of the cameras in the rig.
     sigma_rotation_rad, sigma_translation_m
         Prior standard deviations (c,) of each axis.
+    weight
+        Weights (c,) that the prior has left in the adjustment, of which cameras far from where they were given keep
+        little: their baselines are not as long as given because positions do not say how long they are.
     """
     cameras = len(position_m)
     if not np.isfinite(covariance).all():
@@ -88,10 +96,12 @@ def assess_directions(
     growth[:, 3:] = (position_m - position_m.mean(0)) / sigma[:, 3:]
     functional: Floats = prior @ growth.ravel()
     known = float(functional @ functional)
-    prior_scale = posterior_scale = float("inf")
+    prior_scale = left_scale = posterior_scale = float("inf")
     scale_observed = False
     if known > 1e-6:
         prior_scale = 1.0 / float(np.sqrt(known))
+        of_camera = (functional.reshape(cameras, 6) ** 2).sum(1)
+        left_scale = 1.0 / float(np.sqrt(of_camera @ (np.ones(cameras) if weight is None else weight)))
         posterior_scale = float(np.sqrt(max(float(functional @ posterior @ functional), 0.0))) / known
         scale_observed = posterior_scale < OBSERVED_RATIO * prior_scale
         if not scale_observed:
@@ -102,7 +112,7 @@ def assess_directions(
         observed=np.nan_to_num(ratio, nan=np.inf) < OBSERVED_RATIO,
         ratio=ratio,
         scale_observed=scale_observed,
-        scale_only_prior=posterior_scale > ONLY_PRIOR_RATIO * prior_scale,
+        scale_only_prior=posterior_scale > ONLY_PRIOR_RATIO * left_scale,
         sigma_scale=posterior_scale,
         prior_sigma_scale=prior_scale,
     )

@@ -379,6 +379,7 @@ def _directions(
         position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
+        weight=prior.own_weights(mapper.state),
     )
 
 

@@ -68,7 +68,7 @@ class _Comparison:
         return self if self.share < CLEARLY_BETTER else None
 
     def evenly(self, count: int) -> _Comparison:
-        """At most so many of them, all along."""
+        """Some of them all along, where there are more."""
         return self._at(_evenly(len(self.units), count))
 
     def _at(self, rows: Ints) -> _Comparison:
@@ -186,7 +186,7 @@ def _compared(
 
 
 def _evenly(total: int, count: int) -> Ints:
-    """At most so many places of a list of that length, all along it."""
+    """Places of a list of a length `total`, all along it: not more than `count`."""
     return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)
 
 

@@ -107,6 +107,23 @@ def test_the_baseline_of_two_cameras_is_their_scale() -> None:
     assert np.isnan(found.ratio[:, 4]).all()
 
 
+def test_baselines_that_their_prior_let_go_of_are_not_as_long_as_given() -> None:
+    """Positions tell the scale here, to less than the prior of baselines that are far longer than given says it."""
+    covariance = posterior(everything_but(growth(PLACES[[1, 2]]), cameras=2), cameras=2)
+
+    def only_prior(weight: float) -> bool:
+        return assess_directions(
+            covariance,
+            position_m=PLACES[[1, 2]],
+            sigma_rotation_rad=SIGMA_RAD[:2],
+            sigma_translation_m=SIGMA_M[:2],
+            weight=np.full(2, weight),
+        ).scale_only_prior
+
+    assert only_prior(1.0)
+    assert not only_prior(1e-3)
+
+
 def test_what_nothing_determines_is_not_observed() -> None:
     covariance = posterior([])
     covariance[5, 5] = np.inf

@@ -54,8 +54,9 @@ def refined(simulated: SimulatedDrive) -> tuple[Mapper, Refinement]:
     return mapper, refine(mapper)
 
 
-def drive(given, *, straight: bool = False) -> SimulatedDrive:  # type: ignore[no-untyped-def]
-    return make_simulated_drive(units=STRAIGHT if straight else TURNING, points=900, straight=straight, given=given)
+def drive(given, *, straight: bool = False, points: int = 900) -> SimulatedDrive:  # type: ignore[no-untyped-def]
+    units = STRAIGHT if straight else TURNING
+    return make_simulated_drive(units=units, points=points, straight=straight, given=given)
 
 
 def relative_errors_deg(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray:
@@ -67,7 +68,7 @@ def relative_errors_deg(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray
 @pytest.mark.parametrize("straight", [False, True])
 def test_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
     """Also on a straight street without positions, where the calibration as a whole is held."""
-    simulated = drive(turned(2), straight=straight)
+    simulated = drive(turned(2), straight=straight, points=1500)
     mapper, result = refined(simulated)
     assert result.calibration.free is not straight
     assert [w.camera for w in result.miscalibrations] == [2]
