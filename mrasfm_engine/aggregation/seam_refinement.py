@@ -30,9 +30,9 @@ OBSERVATIONS_OF_IMAGE = 100  # from which transforms are estimated: each has tho
 INITIAL_DAMPING = 1e-6  # scenes lie nearly right before they are adjusted
 SCALE_LOSS = 3.0  # of residuals of shared points, in their median
 CORRELATION = 4.0  # errors that keypoints of one image share: so many of them count once
-# Newton decrement of the last step. Twice as much is how far the transforms, all together, are from the minimum, in
-# squared sigmas of independent errors: half a standard deviation of theirs. Scenes are more bent than that, and the
-# robust weights of what does not fit would still move for as many steps again.
+# Newton decrement of the last step. Twice as much is how far the transforms, all together, are from the minimum where
+# steps become shorter by half, in squared sigmas of independent errors: half a standard deviation of theirs. Scenes are
+# more bent than that, and the robust weights of what does not fit would still move for as many steps again.
 DECREMENT_TOLERANCE = CORRELATION / 8.0
 
 

@@ -331,7 +331,7 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
 
     The normal equations have the weights of the robust loss without its curvature, so that they take the cost for
     steeper than it is: near the minimum every step goes along the one before and is shorter by one factor. Every other
-    step is lengthened by what the rest of that geometric series adds to it, and taken as it is where that costs more
+    step is lengthened by what the rest of that geometric series adds to it; where that costs more it is taken as it is
     [Aitken's extrapolation of vectors: Ramiere and Helfer, Iterative residual-based vector methods to accelerate fixed
     point iterations, Computers and Mathematics with Applications 2015].
     """
@@ -357,7 +357,7 @@ class _Direction:
     decrement: float
 
     def factor_of(self, step: Floats, decrement: float) -> float:
-        """Factor by which to lengthen the step (n,) that follows, so that no more of its kind need to."""
+        """Factor by which to lengthen the step (n,) that follows: the sum of its geometric series."""
         if not (self.decrement > 0.0 and decrement > 0.0):
             return 1.0
         along = -float(step @ self.gradient)
@@ -386,12 +386,13 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         if step is not None:
             direction = _Direction(gradient=system.gradient, decrement=decrement)
-            factor = 1.0 if before is None else before.factor_of(step, decrement)
+            follows = before is not None and damping <= MAX_DAMPING_OF_DECREMENT
+            factor = before.factor_of(step, decrement) if follows and before is not None else 1.0
             trial, trial_costs, trial_cost = problem.after(state, costs, system, factor * step)
+            before = direction if factor == 1.0 else None
             if factor > 1.0 and not trial_cost < cost:
                 factor = 1.0
                 trial, trial_costs, trial_cost = problem.after(state, costs, system, step)
-            before = direction if factor == 1.0 else None
         if step is None or not trial_cost < cost:
             before = None
             if damping > 1e8:
@@ -400,7 +401,9 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        if cost - trial_cost <= options.function_tolerance * cost or (
+        # A lengthened step may end as high on the other side of the minimum.
+        is_flat = factor == 1.0 and cost - trial_cost <= options.function_tolerance * cost
+        if is_flat or (
             # A step that damping holds back is short wherever the minimum is.
             free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance
         ):

@@ -152,7 +152,7 @@ def _corners(scene: Scene, camera: int) -> Floats:
 def _seams(scene: Scene, tracks: Mapping[str, Ints], document: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     """Seams as lines between the units of both scenes that are nearest to each other."""
     for seam in document["seams"]:
-        own = [tracks[seam[side]] for side in ("a", "b")]
+        own = [tracks.get(seam[side], np.zeros(0, dtype=np.int64)) for side in ("a", "b")]
         shown: dict[str, Any] = {"a": seam["a"], "b": seam["b"], "accepted": bool(seam["accepted"])}
         if all(len(track) for track in own):
             a, b = (scene.world_from_rig[track][:, :3, 3] for track in own)

@@ -35,7 +35,7 @@ class GnssTrack:
     sigma_m: Floats  # (n, 3)
     good: Bools  # (n,) False for gross errors and what is held
     swapped_from_local: Floats | None = None
-    # (n,) repetitions of the position before, which are no good ones either; empty where nobody looked for them
+    # (n,) repetitions of the position before, which are not good either; empty where they are not known
     held: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
     def at(self, timestamps_us: Ints, *, max_gap_us: int) -> tuple[Floats, Floats]:

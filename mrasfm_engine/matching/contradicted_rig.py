@@ -30,13 +30,13 @@ from mrasfm_engine.matching.calibration_check import (
 )
 from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
 from mrasfm_engine.matching.simultaneous import are_simultaneous, calibration_sigmas, max_error_rad
-from mrasfm_engine.matching.verification import essential_inliers, relative_pose
+from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, relative_pose
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
-MIN_UNITS = 3  # one after the other, in which two cameras contradict the calibration
-COMPARED_UNITS, SEARCHED_UNITS = 64, 8
+MIN_UNITS = 3  # that follow one another: fewer neither contradict the calibration nor part others that do
+SEARCHED_UNITS = 8
 MAX_LAG = 5  # frames that images may be late
 LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
 STEADY_TURN_DEG = 1.0
@@ -55,21 +55,33 @@ class _Comparison:
 
     @property
     def share(self) -> float:
-        """The usual share."""
+        """Median share."""
         return float(np.median(self.shares))
 
     def contradicting(self) -> _Comparison | None:
-        """The longest run of units that contradict the rig; all units, where those that do so are among others."""
-        low = np.concatenate([[False], self.shares < CLEARLY_BETTER, [False]])
-        begins, ends = (np.flatnonzero(np.diff(low.astype(np.int8)) == step) for step in (1, -1))
-        longest = int(np.argmax(ends - begins)) if len(begins) else 0
-        if len(begins) and ends[longest] - begins[longest] >= MIN_UNITS:
-            return self._at(np.arange(begins[longest], ends[longest]))
+        """Units that contradict the rig: the longest run with some that do so clearly, else all if most do."""
+        run = self._run()
+        if run is not None:
+            return run
         return self if self.share < CLEARLY_BETTER else None
 
     def evenly(self, count: int) -> _Comparison:
-        """Some of them all along, where there are more."""
-        return self._at(_evenly(len(self.units), count))
+        """Units all along, not more than `count`."""
+        return self._at(np.linspace(0, len(self.units) - 1, min(count, len(self.units))).round().astype(np.int64))
+
+    def _run(self) -> _Comparison | None:
+        """The longest run of units below `CLEARLY_BETTER`, of which `MIN_UNITS` are below `CLEARLY_WORSE`.
+
+        Fewer than `MIN_UNITS` that agree, as in a stop, neither part a run nor bound it.
+        """
+        low, count = np.flatnonzero(self.shares < CLEARLY_BETTER), len(self.units)
+        parts = np.split(low, np.flatnonzero(np.diff(low) > MIN_UNITS) + 1)
+        parts = [part for part in parts if (self.shares[part] < CLEARLY_WORSE).sum() >= MIN_UNITS]
+        if not parts:
+            return None
+        longest = max(parts, key=lambda part: int(part[-1] - part[0]))
+        first, end = int(longest[0]), int(longest[-1]) + 1
+        return self._at(np.arange(first if first >= MIN_UNITS else 0, end if count - end >= MIN_UNITS else count))
 
     def _at(self, rows: Ints) -> _Comparison:
         return _Comparison(units=self.units[rows], shares=self.shares[rows])
@@ -138,7 +150,8 @@ def require_images_as_listed(
             if turns_deg[cameras] < STEADY_TURN_DEG and (lag := search.lag())
         }
         if lags:
-            agree = {camera for cameras in compared.keys() - contradicted.keys() for camera in cameras}
+            fit = {cameras for cameras, found in compared.items() if found.share >= CLEARLY_BETTER}
+            agree = {camera for cameras in fit - lags.keys() for camera in cameras}
             spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
             raise _late(drive, lags, agree, spans)
         sigma_deg = np.degrees(calibration_sigmas(drive, calibration)[0])
@@ -166,7 +179,7 @@ def _compared(
     result = {}
     for (a, b), found in sorted(by_cameras.items()):
         shares, units, gate = [], [], PAIR_ERROR_PX / float(focal_px[[a, b]].min())
-        for pair in (found[k] for k in _evenly(len(found), COMPARED_UNITS)):
+        for pair in found:
             rays_a, rays_b = (
                 unproject_pixels(int(kinds[camera]), params[camera], features[image].xy_px[rows])
                 for camera, image, rows in zip((a, b), (pair.image_a, pair.image_b), pair.matches.T, strict=True)
@@ -183,11 +196,6 @@ def _compared(
             best = int(np.argmax(np.median(of_rig, axis=1)))
             result[a, b] = _Comparison(units=np.array(units, dtype=np.int64), shares=of_rig[best])
     return result
-
-
-def _evenly(total: int, count: int) -> Ints:
-    """Places of a list of a length `total`, all along it: not more than `count`."""
-    return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)
 
 
 def _span(drive: Drive, compared: _Comparison, run: _Comparison) -> str:
@@ -232,18 +240,23 @@ class _Search:
     def lag(self) -> int:
         """Frames by which the second camera's images come after those of the first that they fit; 0 for none.
 
-        They have to fit well there, and far better than as they are listed.
+        They have to fit well there, and far better than as they are listed. Epipolar lines alone tell: of far points,
+        noise decides whether they are before the cameras.
         """
         found: dict[int, list[float]] = {}
+        b_from_a = se3.inverse(self._rig[1]) @ self._rig[0]
         for lag, a, b in self._pairs:
-            rays = self._verified(a, b) if lag else None
+            rays = self._verified(a, b)
             if rays is not None:
-                share = share_explained(self._rig[0], self._rig[1], rays.a, rays.b, self._gate)
-                found.setdefault(lag, []).append(share)
+                near = epipolar_errors(b_from_a, rays.a, rays.b) < self._gate
+                found.setdefault(lag, []).append(float(near.mean()))
         shares = {lag: float(np.median(some)) for lag, some in found.items() if len(some) >= MIN_UNITS}
+        listed = shares.pop(0, self._listed.share)
+        if listed >= CLEARLY_BETTER:
+            return 0
         best = max(shares, key=lambda lag: (shares[lag], -abs(lag), lag), default=0)
         left = 1.0 - shares.get(best, 0.0)
-        return best if left <= min(1.0 - CLEARLY_BETTER, LEFT_SHARE * (1.0 - self._listed.share)) else 0
+        return best if left <= min(1.0 - CLEARLY_BETTER, LEFT_SHARE * (1.0 - listed)) else 0
 
     def turn_deg(self) -> float:
         """Angle by which images show two cameras turned against each other from where they are given; 0 for none."""

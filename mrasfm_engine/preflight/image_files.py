@@ -8,8 +8,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import numpy as np
-
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
 from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
@@ -50,7 +48,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         for code in codes:
             oddities[code].append(image.file)
         if not found_here:
-            repeats.look_at(image)
+            repeats.compare(image)
         if progress is not None:
             progress(done, total)
     with ThreadPoolExecutor(MASK_THREADS) as pool:
@@ -91,32 +89,37 @@ class _PathCheck:
 
 
 class _Repeats:
-    """Images that are the same files as those before them: no camera makes the same image twice, whatever it sees."""
+    """Images whose files are those before them, byte for byte: what a camera sees has noise, and is never the same."""
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
-        self._before: dict[int, tuple[DriveImage, int]] = {}  # by camera, with its size in bytes
-        self._repeated: dict[int, list[DriveImage]] = {}
+        self._before: dict[int, tuple[Path, int]] = {}  # by camera, with its size in bytes
+        self._in_a_row: dict[int, int] = {}
+        self._most: dict[int, int] = {}
+        self._repeated: dict[int, list[str]] = {}
 
-    def look_at(self, image: DriveImage) -> None:
+    def compare(self, image: DriveImage) -> None:
         """Compare an image with the one before it of its camera; they come in the order of time."""
-        path = self._drive.root / image.file
-        before, size = self._before.get(image.camera), path.stat().st_size
-        self._before[image.camera] = image, size
-        if before is None or before[1] != size:  # as nearly always
+        path, camera = self._drive.root / image.file, image.camera
+        try:
+            before, size = self._before.get(camera), path.stat().st_size
+            self._before[camera] = path, size
+            # By their sizes most differ already.
+            same = before is not None and before[1] == size and filecmp.cmp(before[0], path, shallow=False)
+        except OSError:  # whoever reads its pixels names it
             return
-        if filecmp.cmp(self._drive.root / before[0].file, path, shallow=False):
-            self._repeated.setdefault(image.camera, []).append(image)
+        self._in_a_row[camera] = self._in_a_row.get(camera, 0) + 1 if same else 0
+        if same:
+            self._repeated.setdefault(camera, []).append(image.file)
+            self._most[camera] = max(self._most.get(camera, 0), self._in_a_row[camera])
 
     def findings(self) -> Iterator[Finding]:
-        """One of each camera that has any."""
-        for camera, images in sorted(self._repeated.items()):
-            units = np.array([image.unit for image in images])
-            most = max(len(run) for run in np.split(units, np.flatnonzero(np.diff(units) > 1) + 1))
+        """One finding of every camera with such images."""
+        for camera, files in sorted(self._repeated.items()):
             yield warning(
                 "repeated-images",
-                f"{len(images)} images of camera {self._drive.cameras[camera].name} are copies of the one before them, "
-                f"up to {most} in a row: {listed([image.file for image in images])}",
+                f"{len(files)} images of camera {self._drive.cameras[camera].name} are copies of the one before them, "
+                f"up to {self._most[camera]} in a row: {listed(files)}",
                 "Take them out of drive.json unless the vehicle stood: they show where it was before. The camera or "
                 "what records it repeats its last image when it gets no new one.",
             )

@@ -17,6 +17,7 @@ from schemas.artifacts import PLAN_CHECKPOINTS, Stage
 from schemas.findings import Finding, as_json, warning
 
 PROBE_UNITS = 5
+USUAL_TIMES = 2.0  # the usual time between two positions, that a repeated one lasts
 
 
 def load_models(run: Run) -> None:
@@ -50,20 +51,28 @@ def prior(run: Run) -> PriorTrajectory:
 
 
 def held_findings(track: GnssTrack) -> list[Finding]:
-    """The finding that a receiver, or who logs it, repeats positions while the vehicle drives on."""
-    if not track.held.any():
+    """The finding that a receiver, or its log, repeats positions for longer than it usually does.
+
+    A log that writes every position of a slow receiver several times is none.
+    """
+    own = np.flatnonzero(~track.held)
+    if len(own) < 2 or not track.held.any():
         return []
-    last_own = np.maximum.accumulate(np.where(track.held, 0, np.arange(len(track.held))))
-    held_us = track.timestamps_us - track.timestamps_us[last_own]
+    times_us = track.timestamps_us[own]
+    until_us = np.append(times_us[1:], track.timestamps_us[-1])
+    is_repeated = np.append(track.held, False)[own + 1]
+    held_us = np.where(is_repeated, until_us - times_us, 0)
+    is_long = held_us > USUAL_TIMES * np.median(np.diff(times_us))
+    if not is_long.any():
+        return []
     longest = int(np.argmax(held_us))
+    times = "once" if is_long.sum() == 1 else f"{int(is_long.sum())} times"
     return [
         warning(
             "gnss-held",
-            f"{int(track.held.sum())} of {len(track.held)} gnss.samples repeat the position before them while the "
-            f"vehicle drives on, for up to {held_us[longest] / 1e6:.1f} s after "
-            f"{track.timestamps_us[last_own[longest]]} us",
-            "Nothing needs to be done: they are left out. Where this is long the receiver had no fix, or its log "
-            "stopped.",
+            f"gnss.samples repeat one position while the vehicle drives on, {times}, for up to "
+            f"{held_us[longest] / 1e6:.1f} s after {times_us[longest]} us",
+            "Nothing needs to be done: repetitions are left out. The receiver had no fix there, or its log stopped.",
         )
     ]
 

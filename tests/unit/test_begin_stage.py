@@ -20,8 +20,13 @@ def track(held: list[int]) -> GnssTrack:
 
 
 def test_positions_that_are_held_are_a_finding_with_the_longest_time() -> None:
-    (finding,) = held_findings(track([3, 8, 9, 10, 11, 19]))
+    (finding,) = held_findings(track([3, 8, 9, 10, 11, 15, 16]))
     assert finding.code == "gnss-held"
-    assert "6 of 20 gnss.samples" in finding.what
-    assert "for up to 0.4 s after 1700000 us" in finding.what
+    assert "2 times, for up to 0.5 s after 1700000 us" in finding.what
+    (finding,) = held_findings(track([17, 18, 19]))
+    assert "once, for up to 0.3 s after 2600000 us" in finding.what
+
+
+def test_a_slow_receiver_that_is_logged_often_is_none() -> None:
     assert held_findings(track([])) == []
+    assert held_findings(track([k for k in range(20) if k % 5])) == []

@@ -99,11 +99,15 @@ def test_a_step_is_lengthened_by_the_rest_of_its_series() -> None:
 def test_a_lengthened_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     case = drive(noise_px=0.5)
     start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
-    plain, _ = solve(replace(case.problem, state=start))
-    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: 100.0)
+    factors = iter([100.0])
+    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: 1.0)
+    plain, of_plain = solve(replace(case.problem, state=start))
+    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: next(factors, 1.0))
     solution, report = solve(replace(case.problem, state=start))
-    assert report.termination is Termination.CONVERGED
-    assert position_errors_m(solution, plain).max() < 1e-3
+    assert next(factors, None) is None
+    # No damping was raised for it, and no step taken back.
+    assert report == of_plain
+    np.testing.assert_array_equal(solution.unit_position_m, plain.unit_position_m)
 
 
 @pytest.mark.parametrize("outlier_fraction", [0.0, 0.1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -65,7 +66,10 @@ def street(
     cameras: int = 2,
     late: int | None = None,
     lag: int = 0,
-    late_units: range = range(UNITS),
+    late_units: Collection[int] = range(UNITS),
+    true: np.ndarray | None = None,
+    points: np.ndarray | None = None,
+    noise_px: float = 0.3,
     given: np.ndarray | None = None,
     speed_m: float = 1.2,
     turn_deg: float = 1.7,
@@ -74,11 +78,13 @@ def street(
     """Images of a street; those of the camera `late` were taken `lag` frames before the ones they are listed with,
     in some units."""
     rng = np.random.default_rng(0)
-    true = looking_ahead(cameras)
+    true = looking_ahead(cameras) if true is None else true
     params = np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * cameras)
     drive = make_drive(true if given is None else given, params, units=UNITS)
     side = rng.choice([-1.0, 1.0], POINTS)
-    points = np.stack([rng.uniform(-10, 60, POINTS), side * rng.uniform(4, 12, POINTS), rng.uniform(-1, 8, POINTS)], 1)
+    if points is None:
+        x, y, z = rng.uniform(-10, 60, POINTS), side * rng.uniform(4, 12, POINTS), rng.uniform(-1, 8, POINTS)
+        points = np.stack([x, y, z], 1)
     descriptors, features = random_descriptors(POINTS, rng), []
     for image in drive.images:
         unit = image.unit - (lag if image.camera == late and image.unit in late_units else 0)
@@ -87,7 +93,7 @@ def street(
         vehicle = se3.transform(se3.exp_so3([0.0, 0.0, heading]), [speed_m * unit, 0.5 * speed_m * heading * unit, 0.0])
         in_camera = se3.apply(se3.inverse(vehicle @ true[image.camera]), points)
         depth = np.maximum(in_camera[:, 2:], 1e-3)
-        xy = FOCAL_PX * in_camera[:, :2] / depth + [WIDTH / 2, HEIGHT / 2] + rng.normal(size=(POINTS, 2)) * 0.3
+        xy = FOCAL_PX * in_camera[:, :2] / depth + [WIDTH / 2, HEIGHT / 2] + rng.normal(size=(POINTS, 2)) * noise_px
         seen = (in_camera[:, 2] > 1) & (xy > 0).all(1) & (xy < [WIDTH, HEIGHT]).all(1)
         features.append(
             ImageFeatures(
@@ -117,7 +123,7 @@ def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag:
         street(late=1, lag=lag).check()
     assert caught.value.code == "camera-late"
     frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
-    assert f"listed {frames} {'before' if lag > 0 else 'after'} them" in caught.value.what
+    assert f"listed {frames} {'before' if lag > 0 else 'after'} them, and not" in caught.value.what
     assert frames in caught.value.remedy
 
 
@@ -141,6 +147,26 @@ def test_a_camera_that_is_late_from_somewhere_on_is_refused_with_the_time(
     at = span.format(*made.drive.timestamps_us)
     assert f"listed 1 frame {'before' if lag > 0 else 'after'} them {at}, and not" in caught.value.what
     assert f"by 1 frame {at}, so that" in caught.value.remedy
+
+
+def test_some_units_that_agree_by_chance_part_no_span() -> None:
+    with pytest.raises(InputError) as caught:
+        street(late=1, lag=1, late_units={*range(4), *range(6, UNITS)}).check()
+    assert "before them, and not" in caught.value.what
+
+
+@pytest.mark.parametrize("apart_m", [0.12, 0.5])
+@pytest.mark.parametrize("off_deg", [0.0, 0.05])
+def test_cameras_behind_each_other_that_look_aside_into_open_country_pass(apart_m: float, off_deg: float) -> None:
+    """Noise puts their far points behind them, and less of it in images that were taken farther apart."""
+    rng = np.random.default_rng(2)
+    left = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    true = se3.transform(np.tile(left, (2, 1, 1)), [[1.7 + apart_m, 0.8, 1.5], [1.7, 0.8, 1.5]])
+    given = true.copy()
+    given[1, :3, :3] = given[1, :3, :3] @ se3.exp_so3([0.0, np.radians(off_deg), 0.0])
+    x, y, z = rng.uniform(-150, 150, POINTS), rng.uniform(20, 300, POINTS), rng.uniform(-5, 30, POINTS)
+    far = np.stack([x, y, z], 1)
+    street(true=true, given=given, points=far, noise_px=0.7, turn_deg=0.3).check()
 
 
 def test_one_frame_that_is_late_is_left_to_the_mapping() -> None:
