@@ -386,8 +386,9 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         if step is not None:
             direction = _Direction(gradient=system.gradient, decrement=decrement)
-            follows = before is not None and damping <= MAX_DAMPING_OF_DECREMENT
-            factor = before.factor_of(step, decrement) if follows and before is not None else 1.0
+            factor = 1.0
+            if before is not None and damping <= MAX_DAMPING_OF_DECREMENT:
+                factor = before.factor_of(step, decrement)
             trial, trial_costs, trial_cost = problem.after(state, costs, system, factor * step)
             before = direction if factor == 1.0 else None
             if factor > 1.0 and not trial_cost < cost:
