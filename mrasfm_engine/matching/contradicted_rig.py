@@ -179,7 +179,7 @@ def _compared(
     result = {}
     for (a, b), found in sorted(by_cameras.items()):
         shares, units, gate = [], [], PAIR_ERROR_PX / float(focal_px[[a, b]].min())
-        for pair in found:
+        for pair in sorted(found, key=lambda pair: drive.images[pair.image_a].unit):
             rays_a, rays_b = (
                 unproject_pixels(int(kinds[camera]), params[camera], features[image].xy_px[rows])
                 for camera, image, rows in zip((a, b), (pair.image_a, pair.image_b), pair.matches.T, strict=True)
