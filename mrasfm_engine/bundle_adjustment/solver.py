@@ -385,12 +385,11 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         step = problem.step(state, system, damping)
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         if step is not None:
-            direction = _Direction(gradient=system.gradient, decrement=decrement)
             factor = 1.0
             if before is not None and damping <= MAX_DAMPING_OF_DECREMENT:
                 factor = before.factor_of(step, decrement)
             trial, trial_costs, trial_cost = problem.after(state, costs, system, factor * step)
-            before = direction if factor == 1.0 else None
+            before = _Direction(gradient=system.gradient, decrement=decrement) if factor == 1.0 else None
             if factor > 1.0 and not trial_cost < cost:
                 factor = 1.0
                 trial, trial_costs, trial_cost = problem.after(state, costs, system, step)

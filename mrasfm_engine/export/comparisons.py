@@ -143,8 +143,9 @@ def _baselines(scene: Scene, centres: Floats) -> Rows:
     if scene.unit_from_image is not None:
         return
     registered = np.flatnonzero(scene.image_registered)
-    unit, camera = (np.array([getattr(scene.drive.images[i], name) for i in registered]) for name in ("unit", "camera"))
-    vehicle = scene.rig_of_camera[camera] if len(camera) else np.zeros(0, np.int64)
+    unit = scene.image_unit[registered]
+    camera = np.array([scene.drive.images[i].camera for i in registered], dtype=np.int64)
+    vehicle = scene.rig_of_camera[camera]
     order = np.argsort(vehicle, kind="stable")
     for own in np.split(order, np.flatnonzero(np.diff(vehicle[order])) + 1):
         cameras, of_camera = np.unique(camera[own], return_inverse=True)

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
@@ -204,6 +205,23 @@ def of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
         calibration_of_independent_errors=prior.without_gauge(certainty.calibration_of_independent_errors),
         scale_with_calibration=prior.without_gauge(certainty.scale_with_calibration),
         sigma_camera=sigma_camera,
+    )
+
+
+def observed_directions(
+    mapper: Mapper, certainty: Covariances | None, covariance: Floats | None = None
+) -> Observability | None:
+    """Directions that the drive observes by its certainty, or by another `covariance` of the calibration."""
+    cameras = len(mapper.camera_kind)
+    if mapper.drive.has_single_camera or certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
+        return None
+    prior = calibration_prior(mapper)
+    return assess_directions(
+        certainty.calibration if covariance is None else covariance,
+        position_m=mapper.state.camera_position_m,
+        sigma_rotation_rad=prior.sigma_rotation_rad,
+        sigma_translation_m=prior.sigma_translation_m,
+        weight=prior.own_weights(mapper.state),
     )
 
 

@@ -12,7 +12,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
     Covariances,
     covariances,
 )
-from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
@@ -25,6 +25,7 @@ from mrasfm_engine.mapping.calibration import (
     calibration_prior,
     has_few_units,
     hold_baselines,
+    observed_directions,
     of_cameras_alone,
     resolve_scale,
     sigma_scale_of_images,
@@ -64,7 +65,7 @@ from mrasfm_engine.mapping.time_offsets import (
     times_may_vary,
     undeclared_readouts,
 )
-from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats
+from mrasfm_engine.types import Bools, Cancel, CountProgress
 from schemas.findings import Finding
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
@@ -229,7 +230,7 @@ def refine(
             progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
     result.certainty = _with_lens_errors(result, _certainty(mapper, result))
-    result.directions = _directions(mapper, result.certainty)
+    result.directions = observed_directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
         result.mean_time_varies &= positions_tell_time(mapper, result.certainty)
@@ -354,7 +355,7 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
         terms=_terms(mapper, result),
         options=_options(mapper, result.sigma_px),
     )
-    found = _directions(mapper, covariances(problem, problem.state, shared_errors=False))
+    found = observed_directions(mapper, covariances(problem, problem.state, shared_errors=False))
     wrong = np.zeros_like(result.recalibrated)
     if found is not None:
         wrong[[one.camera for one in find_miscalibrations(calibration_prior(mapper), mapper.state, found)]] = True
@@ -364,23 +365,6 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
     result.calibration = CalibrationDecision(False, FEW_UNITS)
     result.recalibrated = wrong
     mapper.begin_anew(~wrong)
-
-
-def _directions(
-    mapper: Mapper, certainty: Covariances | None, covariance: Floats | None = None
-) -> Observability | None:
-    """Directions that the drive observes by its certainty, or by another `covariance` of the calibration."""
-    cameras = len(mapper.camera_kind)
-    if mapper.drive.has_single_camera or certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
-        return None
-    prior = calibration_prior(mapper)
-    return assess_directions(
-        certainty.calibration if covariance is None else covariance,
-        position_m=mapper.state.camera_position_m,
-        sigma_rotation_rad=prior.sigma_rotation_rad,
-        sigma_translation_m=prior.sigma_translation_m,
-        weight=prior.own_weights(mapper.state),
-    )
 
 
 def _hold_unobserved(
@@ -397,7 +381,7 @@ def _hold_unobserved(
     make uncertain is not held: the adjustment is sure of it, and the whole scene would follow.
     """
     assert result.certainty is not None
-    weighed = _directions(mapper, result.certainty, result.certainty.calibration_of_independent_errors)
+    weighed = observed_directions(mapper, result.certainty, result.certainty.calibration_of_independent_errors)
     if weighed is None:
         return
     if result.times is not None:

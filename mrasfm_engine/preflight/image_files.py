@@ -93,33 +93,33 @@ class _Repeats:
 
     def __init__(self, drive: Drive) -> None:
         self._drive = drive
-        self._before: dict[int, tuple[Path, int]] = {}  # by camera, with its size in bytes
-        self._in_a_row: dict[int, int] = {}
-        self._most: dict[int, int] = {}
-        self._repeated: dict[int, list[str]] = {}
+        self._runs: dict[int, list[list[str]]] = {}  # by camera, of files with the same contents
 
     def compare(self, image: DriveImage) -> None:
         """Compare an image with the one before it of its camera; they come in the order of time."""
-        path, camera = self._drive.root / image.file, image.camera
-        try:
-            before, size = self._before.get(camera), path.stat().st_size
-            self._before[camera] = path, size
-            # By their sizes most differ already.
-            same = before is not None and before[1] == size and filecmp.cmp(before[0], path, shallow=False)
-        except OSError:  # whoever reads its pixels names it
-            return
-        self._in_a_row[camera] = self._in_a_row.get(camera, 0) + 1 if same else 0
-        if same:
-            self._repeated.setdefault(camera, []).append(image.file)
-            self._most[camera] = max(self._most.get(camera, 0), self._in_a_row[camera])
+        runs = self._runs.setdefault(image.camera, [])
+        if runs and self._are_same(runs[-1][-1], image.file):
+            runs[-1].append(image.file)
+        else:
+            runs.append([image.file])
+
+    def _are_same(self, before: str, after: str) -> bool:
+        try:  # by their sizes most differ already
+            return filecmp.cmp(self._drive.root / before, self._drive.root / after, shallow=False)
+        except OSError:  # whoever reads their pixels names it
+            return False
 
     def findings(self) -> Iterator[Finding]:
         """One finding of every camera with such images."""
-        for camera, files in sorted(self._repeated.items()):
+        for camera, runs in sorted(self._runs.items()):
+            copies = [run[1:] for run in runs if len(run) > 1]
+            if not copies:
+                continue
+            files = [file for run in copies for file in run]
             yield warning(
                 "repeated-images",
                 f"{len(files)} images of camera {self._drive.cameras[camera].name} are copies of the one before them, "
-                f"up to {self._most[camera]} in a row: {listed(files)}",
+                f"up to {max(map(len, copies))} in a row: {listed(files)}",
                 "Take them out of drive.json unless the vehicle stood: they show where it was before. The camera or "
                 "what records it repeats its last image when it gets no new one.",
             )

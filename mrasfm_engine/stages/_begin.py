@@ -39,14 +39,12 @@ def preflight(run: Run) -> None:
 def prior(run: Run) -> PriorTrajectory:
     """Read the prior trajectory of the units."""
     result = prior_trajectory(run.drive, run.config.gnss, use_gnss=run.config.use_gnss)
-    track = result.gnss
-    run.report["prior"] = {
-        "source": result.source,
-        "gnss_samples": 0 if track is None else len(track.good),
-        "gnss_gross_errors": 0 if track is None else int((~track.good & ~track.held).sum()),
-        "gnss_held": 0 if track is None else int(track.held.sum()),
-    }
-    run.report["findings"] += [] if track is None else [as_json(finding) for finding in held_findings(track)]
+    counts = {"gnss_samples": 0, "gnss_gross_errors": 0, "gnss_held": 0}
+    if (track := result.gnss) is not None:
+        gross_errors, held = int((~track.good & ~track.held).sum()), int(track.held.sum())
+        counts = {"gnss_samples": len(track.good), "gnss_gross_errors": gross_errors, "gnss_held": held}
+        run.report["findings"] += [as_json(finding) for finding in held_findings(track)]
+    run.report["prior"] = {"source": result.source, **counts}
     return result
 
 
