@@ -40,6 +40,7 @@ HOST = "127.0.0.1"
 # Of clients that speak no TLS: to load all certificates of the system takes 50 ms of each.
 NO_CERTIFICATES = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 DEADLINE_S = 60.0
+GRACE_S = 10  # for what is under way when the API stops
 REPOSITORY = Path(__file__).resolve().parents[2]
 LIMITS = jobs.RetryLimits(max_attempts=3)
 ONE_ATTEMPT = jobs.RetryLimits(max_attempts=1)
@@ -257,7 +258,7 @@ def api_in_thread(settings: Settings) -> Iterator[Api]:
     """The API served by uvicorn in a thread of this process: a real socket, without the start of a process."""
     migrated(settings)
     app = create_app(settings)
-    server = server_of(app, host=HOST, port=0, timeout_graceful_shutdown=2)
+    server = server_of(app, host=HOST, port=0, timeout_graceful_shutdown=GRACE_S)
     thread = threading.Thread(target=server.run, name="api", daemon=True)
     thread.start()
     wait_until(lambda: server.started or not thread.is_alive(), "the API's start")
