@@ -12,7 +12,7 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from mrasfm_engine import stages
-from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.synthetic.long_route import LongRoute
 from mrasfm_engine.types import Bytes, Floats, Ints
@@ -78,7 +78,7 @@ def store_descriptors(run: stages.Run, route: LongRoute, *, seed: int, number: i
     spans = stages.cut_drive(run)
     total, done = len(run.drive.images), 0
 
-    def made(drive: Drive) -> Generator[ImageFeatures | Incomplete, None, None]:
+    def made(drive: Drive) -> Generator[ImageFeatures | LeftOut, None, None]:
         nonlocal done
         for image in _numbers(drive, len(route.cameras)):
             yield images[image]

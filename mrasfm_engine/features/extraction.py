@@ -16,8 +16,9 @@ from mrasfm_engine.features.own_car import with_margin
 from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
+from mrasfm_engine.io.repeated_images import repeated_images
 from mrasfm_engine.parallel import in_order
-from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
 from mrasfm_engine.types import Bools, Bytes, Cancel, CountProgress
@@ -163,7 +164,7 @@ def features_by_image(
     known: Mapping[str, ImageFeatures] | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
-) -> Generator[ImageFeatures | Incomplete]:
+) -> Generator[ImageFeatures | LeftOut]:
     """Features of every image of the drive, in the order of `drive.images`; those of few images exist at one time.
 
     Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
@@ -173,7 +174,7 @@ def features_by_image(
     Nothing is extracted where `own_cars` is True either: masks (h, w) by camera, as the pixels show the own car.
 
     An image whose pixels are not all there is left out, with the reason in the place of its features: the grey that
-    fills it up has texture at its border.
+    fills it up has texture at its border. So is one that is that before it once more, which shows another place.
 
     Images whose features are `known`, by file, are not read: they were extracted with these very arguments.
 
@@ -186,10 +187,13 @@ def features_by_image(
     """
 
     masks = ImageMasks.of_drive(drive, segmenter, own_cars)
+    is_repeated = repeated_images(drive)
 
-    def one(index: int) -> ImageFeatures | Incomplete:
+    def one(index: int) -> ImageFeatures | LeftOut:
         if cancel is not None and cancel():
             raise CancelledError
+        if is_repeated[index]:
+            return LeftOut.REPEATED
         file = drive.images[index].file
         if known is not None and file in known:
             return known[file]
@@ -213,7 +217,7 @@ def features_by_image(
                 progress(done, count)
 
 
-def _with_left_out(found: Sequence[ImageFeatures | Incomplete]) -> list[ImageFeatures]:
+def _with_left_out(found: Sequence[ImageFeatures | LeftOut]) -> list[ImageFeatures]:
     """Features of all images: those left out have none, of the kind that the others have."""
     kind = next((features for features in found if isinstance(features, ImageFeatures)), NO_FEATURES)
     none = ImageFeatures(
@@ -222,4 +226,4 @@ def _with_left_out(found: Sequence[ImageFeatures | Incomplete]) -> list[ImageFea
         colors=kind.colors[:0],
         scores=None if kind.scores is None else kind.scores[:0],
     )
-    return [replace(none, left_out=features) if isinstance(features, Incomplete) else features for features in found]
+    return [replace(none, left_out=features) if isinstance(features, LeftOut) else features for features in found]

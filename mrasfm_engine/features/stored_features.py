@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.features.extraction import NO_FEATURES
 from mrasfm_engine.io.stage_store import StageWriter, StoredStage
-from mrasfm_engine.scene.drive import Incomplete
+from mrasfm_engine.scene.drive import LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bytes, Floats32, Ints
 
@@ -45,10 +45,10 @@ class FeatureWriter:
         """Number of images so far whose mask a network made."""
         return sum(size > 0 for size in self._mask_bytes)
 
-    def add(self, found: ImageFeatures | Incomplete) -> None:
+    def add(self, found: ImageFeatures | LeftOut) -> None:
         """Write the next image; raises as `StageWriter.add` does."""
         self._window.append(self._windows)
-        if isinstance(found, Incomplete):
+        if isinstance(found, LeftOut):
             self._counts.append(0)
             self._mask_bytes.append(0)
             return
@@ -120,7 +120,7 @@ class FeaturesOnDisk(Sequence[ImageFeatures], ABC):
 class StoredFeatures(FeaturesOnDisk):
     """Features of all images, read from the file at every use."""
 
-    def __init__(self, stage: StoredStage, left_out: Sequence[Incomplete | None]) -> None:
+    def __init__(self, stage: StoredStage, left_out: Sequence[LeftOut | None]) -> None:
         self._stage = stage
         self._left_out = left_out
         self.counts = stage.read("counts")
@@ -194,7 +194,7 @@ def _within_window(counts: Ints, window: Ints) -> Ints:
 class _StoredImage(ImageFeatures):
     """Features of one image that are read when they are asked for, and not kept."""
 
-    def __init__(self, features: StoredFeatures, image: int, left_out: Incomplete | None) -> None:
+    def __init__(self, features: StoredFeatures, image: int, left_out: LeftOut | None) -> None:
         for name, value in (("_features", features), ("_image", image), ("left_out", left_out)):
             object.__setattr__(self, name, value)
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader
-from mrasfm_engine.scene.drive import Incomplete
+from mrasfm_engine.scene.drive import LeftOut
 from mrasfm_engine.types import Bytes
 
 Colours = Literal["RGB", "GRAY"]
@@ -47,7 +47,7 @@ class IncompleteImageError(InputError):
         Whether the data end early or are corrupt on the way; the code is `truncated-image` or `corrupt-image`.
     """
 
-    def __init__(self, what: str, reason: Incomplete) -> None:
+    def __init__(self, what: str, reason: LeftOut) -> None:
         super().__init__(what, remedy="Copy it again from its source.", code=f"{reason}-image")
         self.reason = reason
 
@@ -99,7 +99,7 @@ def decode_png(data: Bytes, flags: int, header: ImageHeader, path: Path) -> Byte
         raise _truncated(path)
     if pixels is None:
         what = f"image {path} is damaged and cannot be decoded"
-        raise IncompleteImageError(what, Incomplete.CORRUPT)
+        raise IncompleteImageError(what, LeftOut.CORRUPT)
     return _of_size(pixels, header, path)
 
 
@@ -123,7 +123,7 @@ def _decoded_in_spite_of(warning: str, data: Bytes, colours: Colours, path: Path
     is_padded = _PADDING_BEFORE_THE_END.search(warning) is not None
     if warning.startswith(_CORRUPT) and not is_padded:
         what = f"image {path} has corrupt data: {warning.removeprefix(_CORRUPT)}"
-        raise IncompleteImageError(what, Incomplete.CORRUPT)
+        raise IncompleteImageError(what, LeftOut.CORRUPT)
     pixels: Bytes | None
     try:
         pixels = _simply_decoded(data, colours, strict=False)
@@ -157,7 +157,7 @@ def _of_size(pixels: Bytes | None, header: ImageHeader, path: Path) -> Bytes:
 
 def _truncated(path: Path) -> IncompleteImageError:
     what = f"image {path} is truncated: its end marker is there, pixels before it are missing"
-    return IncompleteImageError(what, Incomplete.TRUNCATED)
+    return IncompleteImageError(what, LeftOut.TRUNCATED)
 
 
 def _ends_early(png: bytes) -> bool:

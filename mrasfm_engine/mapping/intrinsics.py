@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import MAX_UNKNOWNS_FOR_COVARIANCE, covariances
+from mrasfm_engine.bundle_adjustment.observability_analysis import OBSERVED_RATIO
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
@@ -24,7 +25,6 @@ from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.drive import CAMERA_MODELS, Camera
 from schemas.findings import Finding, warning
 
-OBSERVED_RATIO = 1.0 / 3.0  # a focal length is worth freeing when its posterior is below this share of the prior
 BEYOND_PRIOR_SIGMAS = 4.0
 HELD_TERMS = ("k3", "k4", "k5", "k6")  # of FULL_OPENCV: no prior of them is known, and k1 and k2 look nearly like them
 SIGMA_ASPECT = 5e-4  # of fy over fx: pixels are square

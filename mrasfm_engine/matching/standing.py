@@ -23,6 +23,7 @@ from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.features.extraction import one_opencv_thread
 from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.io.images import check_image_header
+from mrasfm_engine.io.repeated_images import repeated_images
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.small_image_motion import small_images, unit_motion_px
 from mrasfm_engine.scene.drive import Drive, DriveImage
@@ -67,14 +68,16 @@ def find_standing(
     """Find the units that moved less than `min_motion_px`, in pixels of full images.
 
     A drive without any motion keeps all units, as mapping does. Units with an image that is missing or ends early are
-    not left out, nor any with one that is looked at and cannot be read: the extraction says what is wrong with it.
+    not left out, nor any with one that is looked at and cannot be read: the extraction says what is wrong with it. Nor
+    are units whose images are all those before them once more, which say nothing of the vehicle.
 
     Raises
     ------
     CancelledError
         Where `cancel` answers True.
     """
-    moves, of_unit = moving_by_prior(drive, prior), _by_unit(drive)
+    of_unit = _by_unit(drive)
+    moves = moving_by_prior(drive, prior) | _repeats(drive)
     # A standing unit is compared with one before it: the last that moves is read as well.
     wanted = np.flatnonzero(~moves | np.append(~moves[1:], False))
 
@@ -239,6 +242,14 @@ class _PriorWay:
         """Answer `moved` for two units of which the prior knows something."""
         units = np.array([unit_a, unit_b])
         return bool(self.known[units].all() and self.moved(self.times_s[units[:1]], self.times_s[units[1:]])[0])
+
+
+def _repeats(drive: Drive) -> Bools:
+    """Units (u,) that have images, of which none is another one than before."""
+    own, unit = np.ones(len(drive.timestamps_us), dtype=np.bool_), [image.unit for image in drive.images]
+    own[unit] = False
+    own[np.array(unit, dtype=np.int64)[~repeated_images(drive)]] = True
+    return ~own
 
 
 def _by_unit(drive: Drive) -> list[list[DriveImage]]:

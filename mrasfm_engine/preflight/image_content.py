@@ -21,8 +21,9 @@ from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_gray
 from mrasfm_engine.io.left_out_images import sample_findings
+from mrasfm_engine.io.repeated_images import have_same_bytes
 from mrasfm_engine.preflight.drive_check import check_drive, is_sound
-from mrasfm_engine.scene.drive import Drive, DriveImage, Incomplete
+from mrasfm_engine.scene.drive import Drive, DriveImage, LeftOut
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Floats32
 from schemas.findings import Finding, Severity, error, listed, warning
 
@@ -109,19 +110,19 @@ def check_content(
     paired = {i for pair in pairs for i in pair}
     images = sorted(paired | _sampled_besides(drive, paired))
 
-    def look(i: int) -> _Look | Incomplete | Finding:
+    def look(i: int) -> _Look | LeftOut | Finding:
         if cancel():
             raise CancelledError
         return _look(drive, drive.images[i])
 
     looks: dict[int, _Look] = {}
-    incomplete: dict[str, Incomplete] = {}
+    incomplete: dict[str, LeftOut] = {}
     findings: list[Finding] = []
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         for i, found in zip(images, pool.map(look, images), strict=True):
             if isinstance(found, Finding):
                 findings.append(found)
-            elif isinstance(found, Incomplete):
+            elif isinstance(found, LeftOut):
                 incomplete[drive.images[i].file] = found
             else:
                 looks[i] = found
@@ -184,7 +185,7 @@ def _sampled_besides(drive: Drive, taken: set[int]) -> set[int]:
     return result
 
 
-def _look(drive: Drive, image: DriveImage) -> _Look | Incomplete | Finding:
+def _look(drive: Drive, image: DriveImage) -> _Look | LeftOut | Finding:
     try:
         pixels = read_image_gray(drive.root / image.file)
     except IncompleteImageError as problem:
@@ -266,7 +267,9 @@ def _is_blurred_camera(camera: int, detail: dict[int, float], fineness: dict[int
 
 def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss: bool) -> list[Finding]:
     still: dict[tuple[int, int], list[bool]] = {}  # by the two units: of every camera with enough contrast
-    for a, b in pairs:
+    # An image that is another once more says nothing of the vehicle.
+    differing = [(a, b) for a, b in pairs if not have_same_bytes(drive, a.image.file, b.image.file)]
+    for a, b in differing or pairs:
         verdict = _is_still(a.small, b.small)
         if verdict is not None:
             still.setdefault((a.image.unit, b.image.unit), []).append(verdict)

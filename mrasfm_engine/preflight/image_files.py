@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import filecmp
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import groupby
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
 from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
+from mrasfm_engine.io.left_out_images import REPEATED_REMEDY
+from mrasfm_engine.io.repeated_images import repeated_images
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import CountProgress
 from schemas.findings import Finding, Severity, error, listed, warning
@@ -35,7 +37,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         Called with how many of how many images are checked.
     """
     findings: list[Finding] = []
-    paths, repeats = _PathCheck(drive.root), _Repeats(drive)
+    paths = _PathCheck(drive.root)
     oddities: dict[str, list[str]] = {code: [] for code in _GROUPED}
     # One mask may serve many images, as that of the own car's body.
     masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
@@ -47,8 +49,6 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         findings += found_here
         for code in codes:
             oddities[code].append(image.file)
-        if not found_here:
-            repeats.compare(image)
         if progress is not None:
             progress(done, total)
     with ThreadPoolExecutor(MASK_THREADS) as pool:
@@ -60,7 +60,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         if oddities[code]:
             files = oddities[code]
             findings.append(warning(code, f"{len(files)} images {state}: {listed(files)}", remedy))
-    return [*_gather(findings), *repeats.findings(), *_unlisted(drive)]
+    return [*_gather(findings), *_repeated(drive), *_unlisted(drive)]
 
 
 class _PathCheck:
@@ -88,41 +88,21 @@ class _PathCheck:
             return False
 
 
-class _Repeats:
-    """Images whose files are those before them, byte for byte: what a camera sees has noise, and is never the same."""
-
-    def __init__(self, drive: Drive) -> None:
-        self._drive = drive
-        self._runs: dict[int, list[list[str]]] = {}  # by camera, of files with the same contents
-
-    def compare(self, image: DriveImage) -> None:
-        """Compare an image with the one before it of its camera; they come in the order of time."""
-        runs = self._runs.setdefault(image.camera, [])
-        if runs and self._are_same(runs[-1][-1], image.file):
-            runs[-1].append(image.file)
-        else:
-            runs.append([image.file])
-
-    def _are_same(self, before: str, after: str) -> bool:
-        try:  # by their sizes most differ already
-            return filecmp.cmp(self._drive.root / before, self._drive.root / after, shallow=False)
-        except OSError:  # whoever reads their pixels names it
-            return False
-
-    def findings(self) -> Iterator[Finding]:
-        """One finding of every camera with such images."""
-        for camera, runs in sorted(self._runs.items()):
-            copies = [run[1:] for run in runs if len(run) > 1]
-            if not copies:
-                continue
-            files = [file for run in copies for file in run]
-            yield warning(
-                "repeated-images",
-                f"{len(files)} images of camera {self._drive.cameras[camera].name} are copies of the one before them, "
-                f"up to {max(map(len, copies))} in a row: {listed(files)}",
-                "Take them out of drive.json unless the vehicle stood: they show where it was before. The camera or "
-                "what records it repeats its last image when it gets no new one.",
-            )
+def _repeated(drive: Drive) -> Iterator[Finding]:
+    """One finding of every camera with images that are those before them."""
+    is_repeated = repeated_images(drive)
+    for camera, given in enumerate(drive.cameras):
+        of_camera = [i for i, image in enumerate(drive.images) if image.camera == camera]
+        runs = [list(run) for is_copy, run in groupby(of_camera, key=is_repeated.__getitem__) if is_copy]
+        if not runs:
+            continue
+        files = [drive.images[i].file for run in runs for i in run]
+        yield warning(
+            "repeated-images",
+            f"{len(files)} images of camera {given.name} are copies of the one before them, "
+            f"up to {max(map(len, runs))} in a row: {listed(files)}",
+            REPEATED_REMEDY,
+        )
 
 
 def _check_image(drive: Drive, image: DriveImage, paths: _PathCheck) -> tuple[list[Finding], list[str]]:

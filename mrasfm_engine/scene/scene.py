@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.road import Road
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from schemas.notebook_table import notebook_table
@@ -32,7 +32,7 @@ class ImageFeatures:
     # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where no network ran
     made_mask: Bytes | None = None
     # of an image without keypoints that takes no part, as its pixels are not all there
-    left_out: Incomplete | None = None
+    left_out: LeftOut | None = None
 
     def __post_init__(self) -> None:
         if not len(self.classes):

@@ -14,7 +14,7 @@ from mrasfm_engine.features.extraction import features_by_image
 from mrasfm_engine.features.stored_features import FeaturesOnDisk, FeatureWriter, StoredFeatures
 from mrasfm_engine.io import left_out_images
 from mrasfm_engine.io.stage_store import StageWriter
-from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import CLASS_NAMES, count_classes
 from mrasfm_engine.stages._own_car import own_cars
@@ -57,7 +57,7 @@ def extract(run: Run) -> tuple[StoredFeatures, dict[str, Any]]:
 
 
 def store_features(
-    run: Run, extracted: Callable[[], Generator[ImageFeatures | Incomplete, None, None]]
+    run: Run, extracted: Callable[[], Generator[ImageFeatures | LeftOut, None, None]]
 ) -> tuple[StoredFeatures, dict[str, Any]]:
     """The stage and its report, of features in the order of the run's images, which are asked for where it is not done
     already."""
@@ -65,11 +65,11 @@ def store_features(
     def work(stage: StageWriter) -> dict[str, Any]:
         writer = FeatureWriter(stage)
         by_class: Counter[str] = Counter()
-        left_out: dict[str, Incomplete] = {}
+        left_out: dict[str, LeftOut] = {}
         with closing(extracted()) as every:
             for image, found in zip(run.drive.images, every, strict=True):
                 writer.add(found)
-                if isinstance(found, Incomplete):
+                if isinstance(found, LeftOut):
                     left_out[image.file] = found
                 else:
                     by_class.update(count_classes([found.classes]))
@@ -82,7 +82,7 @@ def store_features(
 
 
 def describe_features(
-    drive: Drive, counts: Ints, by_class: Mapping[str, int], made_masks: int, left_out: Mapping[str, Incomplete]
+    drive: Drive, counts: Ints, by_class: Mapping[str, int], made_masks: int, left_out: Mapping[str, LeftOut]
 ) -> dict[str, Any]:
     """The report of the stage: keypoints by image (images,) and by class, masks, and files that were left out."""
     few = [drive.images[i].file for i in np.flatnonzero(counts < 100)]
@@ -99,12 +99,12 @@ def describe_features(
     }
 
 
-def left_out_of(report: Mapping[str, Any]) -> dict[str, Incomplete]:
+def left_out_of(report: Mapping[str, Any]) -> dict[str, LeftOut]:
     """Files of images that were left out, with the reasons, from the stage's report."""
-    return {image["file"]: Incomplete(image["reason"]) for image in report["images_left_out"]}
+    return {image["file"]: LeftOut(image["reason"]) for image in report["images_left_out"]}
 
 
-def require_features(run: Run, found: FeaturesOnDisk, left_out: Mapping[str, Incomplete]) -> None:
+def require_features(run: Run, found: FeaturesOnDisk, left_out: Mapping[str, LeftOut]) -> None:
     """Say what was left out, and refuse a drive that shows nothing.
 
     Raises

@@ -14,7 +14,7 @@ from mrasfm_engine.mapping.submaps import join
 from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
-from mrasfm_engine.scene.drive import Incomplete
+from mrasfm_engine.scene.drive import LeftOut
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.submaps import share_a_submap
@@ -56,7 +56,7 @@ def _joined_features(run: Run, submaps: Sequence[SubmapRun]) -> JoinedFeatures:
     """Features of all images, and what the stage says of them."""
     found = JoinedFeatures([(submap.features, submap.images) for submap in submaps])
     reports = [submap.entry(Stage.FEATURES) for submap in submaps]
-    left_out: dict[str, Incomplete] = {}
+    left_out: dict[str, LeftOut] = {}
     for report in reports:
         left_out |= left_out_of(report)
     by_class: Counter[str] = Counter()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,6 +47,19 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         codes = {one["code"] for one in report["findings"]}
         if finding is not None:
             yield exactly("18", f"kitti06, {title}: the finding {finding}", int(finding in codes), 1)
+    for title, units, options, kind in (
+        ("every fifth unit is the one before once more", range(4, 51, 5), (), "metric"),
+        ("a recorder that hangs for 8 units, without GNSS", range(20, 28), ("--no-gnss",), "similarity"),
+    ):
+        scene, copy = work / f"kitti06, {title}", edited(drive, work / f"kitti06, {title}, drive", [])
+        _repeat(copy, units)
+        mrasfm("reconstruct", copy, "--out", scene, *options)
+        errors, codes = evaluate(scene, drive), {one["code"] for one in read_report(scene)["findings"]}
+        images = 2 * (51 - len(units))
+        yield exactly("18", f"kitti06, {title}: images registered", errors["registered_images"], images)
+        what, value = f"kitti06, {title}: {kind} RMSE", errors[kind]["rmse_m"]
+        yield Figure(line="18", what=what, value=value, unit="m", most=0.1)
+        yield exactly("18", f"kitti06, {title}: the finding repeated-images", int("repeated-images" in codes), 1)
     for title, edit, said in (
         ("a camera one frame late", _late, "listed 1 frame before them"),
         ("a camera without one of its frames", _without_a_frame, "listed 1 frame after them from 2500000 us on"),
@@ -57,6 +72,14 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         except CommandFailed as error:
             message = str(error)
         yield exactly("18", f"kitti06, {title}: refused with the reason", int(said in message), 1)
+
+
+def _repeat(drive: Path, units: range) -> None:
+    """Files of some units become those of the units before them."""
+    frames = json.loads((drive / "drive.json").read_text(encoding="utf-8"))["frames"]
+    for unit in units:
+        for name, image in frames[unit]["images"].items():
+            shutil.copyfile(drive / frames[unit - 1]["images"][name]["file"], drive / image["file"])
 
 
 def _jumping(*jumps: tuple[int, float]) -> Edit:

@@ -1,4 +1,7 @@
-"""Images cut to a third with an end marker after them take no part, and are named; the rest of the drive is used."""
+"""Images that take no part and are named: cut to a third with an end marker after them, or those before once more.
+
+The rest of the drive is used.
+"""
 
 from __future__ import annotations
 
@@ -23,6 +26,14 @@ CAMERAS = ["front", "left"]
 def truncate(variant: Variant, files: list[str]) -> None:
     for file in files:
         variant.write(file, cut((variant.root / file).read_bytes()))
+
+
+def repeat(variant: Variant, unit: int, *cameras: str) -> list[str]:
+    """The files of a unit, or of some of its cameras, which become those of the unit before."""
+    before, now = (variant.document["frames"][k]["images"] for k in (unit - 1, unit))
+    for camera in cameras or now:
+        variant.write(now[camera]["file"], (variant.root / before[camera]["file"]).read_bytes())
+    return [now[camera]["file"] for camera in cameras or now]
 
 
 def images_of(variant: Variant) -> list[str]:
@@ -83,9 +94,26 @@ def test_all_truncated(variant: Variant, mrasfm: Run) -> None:
     assert not variant.scene.exists()
 
 
+def test_a_unit_that_is_recorded_twice(variant: Variant, mrasfm: Run) -> None:
+    variant.keep(cameras=CAMERAS, units=6).save()
+    repeated = repeat(variant, 3)
+    result = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
+    assert result.code == 0, result.err
+    assert "units registered: 5 of 6" in result.out
+    assert f"2 of 12 images are copies of the one before them and left out: {', '.join(repeated)}" in result.out
+    report = read_report(variant.scene)
+    assert report["by_stage"]["features"]["images_left_out"] == [
+        {"file": file, "reason": "repeated"} for file in repeated
+    ]
+    assert [f["code"] for f in report["findings"]].count("repeated-images") == 1
+
+
 @pytest.mark.slow
-def test_nothing_of_the_grey_rest_is_in_the_scene(variant: Variant, mrasfm: Run, tmp_path: Path) -> None:
-    """A truncated image counts as one that was never recorded."""
+@pytest.mark.parametrize("spoil", [truncate, lambda variant, files: repeat(variant, 2, "left")])
+def test_nothing_of_what_is_left_out_is_in_the_scene(
+    variant: Variant, mrasfm: Run, tmp_path: Path, spoil: Callable[[Variant, list[str]], object]
+) -> None:
+    """An image that is left out counts as one that was never recorded."""
     variant.keep(cameras=CAMERAS, units=5)
     file = variant.document["frames"][2]["images"]["left"]["file"]
     without = json.loads(json.dumps(variant.document))
@@ -93,7 +121,7 @@ def test_nothing_of_the_grey_rest_is_in_the_scene(variant: Variant, mrasfm: Run,
     variant.save()
     shutil.copytree(variant.root, tmp_path / "without")
     (tmp_path / "without" / "drive.json").write_text(json.dumps(without), encoding="utf-8")
-    truncate(variant, [file])
+    spoil(variant, [file])
     poses = []
     for root in (variant.root, tmp_path / "without"):
         scene = tmp_path / f"scene-{root.name}"

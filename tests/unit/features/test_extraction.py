@@ -10,7 +10,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.features.sift import SiftExtractor
-from mrasfm_engine.scene.drive import Drive, Incomplete
+from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from schemas import Camera, DriveManifest, Frame, FrameImage, Pose, Rig
@@ -76,8 +76,8 @@ def test_an_empty_image_has_no_keypoints() -> None:
 def make_drive(folder: Path, width: int = WIDTH) -> Drive:
     image, _ = blobs(np.random.default_rng(3))
     frames = []
-    for i in range(3):
-        cv2.imwrite(str(folder / f"{i}.png"), image)
+    for i in range(3):  # the same pixels in other bytes
+        cv2.imwrite(str(folder / f"{i}.png"), image, [cv2.IMWRITE_PNG_COMPRESSION, i + 1])
         frames.append(Frame(timestamp_us=i * 100_000, source_frame=i, images={"cam": FrameImage(file=f"{i}.png")}))
     camera = Camera(
         name="cam",
@@ -189,10 +189,19 @@ def test_an_image_of_which_pixels_are_missing_is_left_out(tmp_path: Path, capfd:
     drive = masked_drive(tmp_path, np.full((HEIGHT, WIDTH), 2, np.uint8))
     (tmp_path / "0.png").write_bytes(cut((tmp_path / "0.png").read_bytes()))
     found = extract_features(drive, SiftExtractor(FeatureConfig()), threads=2)
-    assert [f.left_out for f in found] == [Incomplete.TRUNCATED, None, None]
+    assert [f.left_out for f in found] == [LeftOut.TRUNCATED, None, None]
     assert [len(f.xy_px) > 50 for f in found] == [False, True, True]
     assert len(found[0].xy_px) == len(found[0].descriptors) == len(found[0].colors) == 0
     capfd.readouterr()  # the decoder's own complaint
+
+
+def test_an_image_that_is_the_one_before_once_more_is_left_out(tmp_path: Path) -> None:
+    drive = make_drive(tmp_path)
+    (tmp_path / "1.png").write_bytes((tmp_path / "0.png").read_bytes())
+    (tmp_path / "2.png").write_bytes((tmp_path / "0.png").read_bytes())
+    found = extract_features(drive, SiftExtractor(FeatureConfig()), threads=2)
+    assert [f.left_out for f in found] == [None, LeftOut.REPEATED, LeftOut.REPEATED]
+    assert [len(f.xy_px) > 50 for f in found] == [True, False, False]
 
 
 def test_what_is_left_out_has_features_of_the_others_kind(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,7 @@ import pytest
 from mrasfm_engine.features import stored_features
 from mrasfm_engine.features.stored_features import FeatureWriter, JoinedFeatures, StoredFeatures
 from mrasfm_engine.io.stage_store import StageStore
-from mrasfm_engine.scene.drive import Incomplete
+from mrasfm_engine.scene.drive import LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
 
 KINDS = ("xy_px", "descriptors", "colors", "classes", "scores", "made_mask")
@@ -36,7 +36,7 @@ def test_features_come_back_as_they_were(
     rng, store = np.random.default_rng(0), StageStore(tmp_path)
     counts = [None, 30, 0, 200, None, None, 1, 70, 0, None]
     given = [
-        Incomplete.TRUNCATED if n is None else an_image(n, rng, network=network, mask=i % 3 == 0)
+        LeftOut.TRUNCATED if n is None else an_image(n, rng, network=network, mask=i % 3 == 0)
         for i, n in enumerate(counts)
     ]
     with store.writing("features", "key") as stage:
@@ -47,12 +47,12 @@ def test_features_come_back_as_they_were(
         stage.finish({})
     opened = store.open("features", "key")
     assert opened is not None
-    read = StoredFeatures(opened, [Incomplete.TRUNCATED if n is None else None for n in counts])
+    read = StoredFeatures(opened, [LeftOut.TRUNCATED if n is None else None for n in counts])
     assert len(read) == len(given)
     assert read.counts.tolist() == [n or 0 for n in counts]
     width = 64 if network else 128
     for found, expected in zip(read, given, strict=True):
-        if isinstance(expected, Incomplete):
+        if isinstance(expected, LeftOut):
             assert found.left_out == expected
             assert found.xy_px.shape == (0, 2)
             assert found.descriptors.shape == (0, width)
@@ -79,16 +79,16 @@ def test_all_images_left_out(tmp_path: Path) -> None:
     store = StageStore(tmp_path)
     with store.writing("features", "key") as stage:
         writer = FeatureWriter(stage)
-        writer.add(Incomplete.CORRUPT)
+        writer.add(LeftOut.CORRUPT)
         writer.finish()
         stage.finish({})
     opened = store.open("features", "key")
     assert opened is not None
-    (found,) = StoredFeatures(opened, [Incomplete.CORRUPT])
+    (found,) = StoredFeatures(opened, [LeftOut.CORRUPT])
     assert found.descriptors.shape == (0, 128)
 
 
-def stored(folder: Path, given: list[ImageFeatures | Incomplete], name: str) -> StoredFeatures:
+def stored(folder: Path, given: list[ImageFeatures | LeftOut], name: str) -> StoredFeatures:
     store = StageStore(folder)
     with store.writing(name, "key") as stage:
         writer = FeatureWriter(stage)
@@ -98,21 +98,21 @@ def stored(folder: Path, given: list[ImageFeatures | Incomplete], name: str) -> 
         stage.finish({})
     opened = store.open(name, "key")
     assert opened is not None
-    return StoredFeatures(opened, [found if isinstance(found, Incomplete) else None for found in given])
+    return StoredFeatures(opened, [found if isinstance(found, LeftOut) else None for found in given])
 
 
 def test_features_of_sub_maps_are_those_of_the_drive(tmp_path: Path) -> None:
     """Images 3 and 4 are in both, image 7 was left out, and the third file has no keypoint at all."""
     rng = np.random.default_rng(1)
     images = [an_image(n, rng, network=True, mask=False) for n in (5, 0, 7, 9, 3, 8, 1)]
-    first, second = images[:5], [*images[3:], Incomplete.CORRUPT]
-    parts = [stored(tmp_path, first, "a"), stored(tmp_path, second, "b"), stored(tmp_path, [Incomplete.CORRUPT], "c")]
+    first, second = images[:5], [*images[3:], LeftOut.CORRUPT]
+    parts = [stored(tmp_path, first, "a"), stored(tmp_path, second, "b"), stored(tmp_path, [LeftOut.CORRUPT], "c")]
     joined = JoinedFeatures([(parts[0], np.arange(5)), (parts[1], np.arange(3, 8)), (parts[2], np.array([8]))])
     assert len(joined) == 9
     assert joined.counts.tolist() == [5, 0, 7, 9, 3, 8, 1, 0, 0]
     for found, expected in zip(joined[:7], images, strict=True):
         np.testing.assert_array_equal(found.xy_px, expected.xy_px)
         np.testing.assert_array_equal(found.descriptors, expected.descriptors)
-    assert [found.left_out for found in joined][6:] == [None, Incomplete.CORRUPT, Incomplete.CORRUPT]
+    assert [found.left_out for found in joined][6:] == [None, LeftOut.CORRUPT, LeftOut.CORRUPT]
     assert {found.descriptors.shape[1] for found in joined} == {64}
     assert {found.descriptors.dtype for found in joined} == {np.dtype(np.float32)}

@@ -88,6 +88,24 @@ def test_jpegs_in_colour_with_noise_of_each_channel(tmp_path: Path) -> None:
     assert found.moved_px[~found.included].max() < 0.5, "noise is no motion"
 
 
+def test_images_that_are_those_before_once_more_do_not_stand(tmp_path: Path) -> None:
+    """What records them hangs, and says nothing of the car; one camera that hangs does not hide a stop."""
+    drive = write(tmp_path / "all", 11, lambda unit, camera: view(camera, 25.0 * unit), cameras=2)
+    hang(drive, range(3, 8), cameras=2)
+    assert standing_of(drive).included.all()
+    drive = write(tmp_path / "one", 11, lambda unit, camera: view(camera, stop_px(unit)), cameras=2)
+    hang(drive, range(3, 8), cameras=1)
+    assert standing_of(drive).spans() == [(2, 7)]
+
+
+def hang(drive: Drive, units: range, cameras: int) -> None:
+    """Images of the first cameras in some units become the last ones before these."""
+    for camera in range(cameras):
+        file = {image.unit: drive.root / image.file for image in drive.images if image.camera == camera}
+        for unit in units:
+            file[unit].write_bytes(file[units[0] - 1].read_bytes())
+
+
 def test_grey_images_do_not_stand(tmp_path: Path) -> None:
     """They show nothing: as a picture of another exposure, each would be any other."""
 

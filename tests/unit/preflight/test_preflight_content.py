@@ -187,6 +187,10 @@ def test_one_camera_that_repeats_itself_is_no_standing(make_drive: Callable[...,
     assert findings_of(root) == []
 
 
+def test_frames_that_are_recorded_twice_are_no_standing(make_drive: Callable[..., Path]) -> None:
+    assert findings_of(make_drive(speed_px=lambda frame: 20.0 * (frame % 2), noise=0.0)) == []
+
+
 @pytest.mark.parametrize("gnss", [None, lambda frame: 0.2 * (frame % 2)])
 def test_standing_all_the_time(make_drive: Callable[..., Path], gnss: Callable[[int], float] | None) -> None:
     root = make_drive(speed_px=lambda frame: 0.0, gnss=gnss)
