@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import resource
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -135,22 +136,34 @@ def _check_times(recorded: _Recorded) -> list[Finding]:
                     "Give frames.timestamp_us in microseconds, and the samples of gnss and rough_poses too.",
                 )
             )
-    off = [
-        (abs(own - of_frame), file)
-        for _, file, own, of_frame in recorded.images
-        if abs(own - of_frame) > MAX_UNSYNCHRONISED_US
-    ]
-    if off:
-        worst = max(off)
-        findings.append(
-            warning(
-                "unsynchronised",
-                f"{len(off)} images are over {MAX_UNSYNCHRONISED_US // 1000} ms from their frame's time, most "
-                f"{worst[1]} with {worst[0] / 1000:.0f} ms",
-                "Put images into the frame that is nearest in time.",
-            )
-        )
-    return findings
+    return [*findings, *_check_synchronisation(recorded)]
+
+
+def _check_synchronisation(recorded: _Recorded) -> list[Finding]:
+    """Find images far from their frame's time, and cameras most of whose images belong to other frames."""
+    times_us = recorded.timestamps_us
+    off: list[tuple[int, str]] = []
+    images, elsewhere = Counter[str](), Counter[str]()
+    for camera, file, own, of_frame in recorded.images:
+        images[camera] += 1
+        if abs(own - of_frame) <= MAX_UNSYNCHRONISED_US:
+            continue
+        off.append((abs(own - of_frame), file))
+        first, last = sorted((own, of_frame))
+        lies_between = np.searchsorted(times_us, last, "left") > np.searchsorted(times_us, first, "right")
+        elsewhere[camera] += bool(lies_between)
+    if not off:
+        return []
+    lost = [camera for camera, count in elsewhere.items() if 2 * count > images[camera]]
+    most_us, file = max(off)
+    what = (
+        f"{len(off)} images are over {MAX_UNSYNCHRONISED_US // 1000} ms from their frame's time, most {file} with "
+        f"{most_us / 1000:.0f} ms"
+    )
+    if lost:
+        what += f"; most images of camera {listed(lost)} have other frames between"
+    remedy = "Put images into the frame that is nearest in time; times of frames and of images are on one clock."
+    return [(error if lost else warning)("unsynchronised", what, remedy)]
 
 
 def _check_rig(manifest: DriveManifest) -> list[Finding]:

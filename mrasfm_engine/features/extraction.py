@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -16,7 +16,6 @@ from mrasfm_engine.features.own_car import with_margin
 from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
-from mrasfm_engine.io.repeated_images import repeated_images
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -133,6 +132,7 @@ def extract_features(
     segmenter: Segmenter | None = None,
     class_margin_px: int = 2,
     own_cars: Sequence[Bools | None] = (),
+    repeated: Collection[str] = (),
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
 ) -> list[ImageFeatures]:
@@ -147,6 +147,7 @@ def extract_features(
         segmenter=segmenter,
         class_margin_px=class_margin_px,
         own_cars=own_cars,
+        repeated=repeated,
         progress=progress,
         cancel=cancel,
     )
@@ -161,6 +162,7 @@ def features_by_image(
     segmenter: Segmenter | None = None,
     class_margin_px: int = 2,
     own_cars: Sequence[Bools | None] = (),
+    repeated: Collection[str] = (),
     known: Mapping[str, ImageFeatures] | None = None,
     progress: CountProgress | None = None,
     cancel: Cancel | None = None,
@@ -174,7 +176,7 @@ def features_by_image(
     Nothing is extracted where `own_cars` is True either: masks (h, w) by camera, as the pixels show the own car.
 
     An image whose pixels are not all there is left out, with the reason in the place of its features: the grey that
-    fills it up has texture at its border. So is one that is that before it once more, which shows another place.
+    fills it up has texture at its border. So is one of the `repeated` files, which shows where the vehicle was before.
 
     Images whose features are `known`, by file, are not read: they were extracted with these very arguments.
 
@@ -187,14 +189,13 @@ def features_by_image(
     """
 
     masks = ImageMasks.of_drive(drive, segmenter, own_cars)
-    is_repeated = repeated_images(drive)
 
     def one(index: int) -> ImageFeatures | LeftOut:
         if cancel is not None and cancel():
             raise CancelledError
-        if is_repeated[index]:
-            return LeftOut.REPEATED
         file = drive.images[index].file
+        if file in repeated:
+            return LeftOut.REPEATED
         if known is not None and file in known:
             return known[file]
         try:
@@ -209,9 +210,13 @@ def features_by_image(
         classes = classes_at(confident_classes(masked.codes, class_margin_px), found.xy_px)
         return replace(found, classes=classes, made_mask=made_mask)
 
-    count = len(drive.images)
+    count, before = len(drive.images), dict[int, LeftOut | None]()
     with one_opencv_thread():
         for done, found in enumerate(in_order(threads, one, range(count)), 1):
+            camera = drive.images[done - 1].camera
+            if found == LeftOut.REPEATED:  # of what is truncated or corrupt, a copy is no better
+                found = before.get(camera) or LeftOut.REPEATED
+            before[camera] = found if isinstance(found, LeftOut) else None
             yield found
             if progress is not None:
                 progress(done, count)

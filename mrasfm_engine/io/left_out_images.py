@@ -1,24 +1,18 @@
-"""Findings on images that are not used: some of their pixels are missing or corrupt, or they are the one before."""
+"""Findings on images that were not used, as some of their pixels are missing or corrupt."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.scene.drive import LeftOut
+from mrasfm_engine.scene.drive import INCOMPLETE, LeftOut
 from schemas.findings import Finding, error, listed, warning
 
 NAMED = 20  # files that a finding names; the report names all
-REPEATED_REMEDY = (
-    "Record again where poses are missing: a reconstruction leaves such images out, as they show where the vehicle was "
-    "before. The camera, or what records it, repeats its last image when it gets no new one."
-)
-_REMEDIES = dict.fromkeys(LeftOut, "Copy them again from their source and reconstruct again.") | {
-    LeftOut.REPEATED: REPEATED_REMEDY
-}
-_STATES = {reason: str(reason) for reason in LeftOut} | {LeftOut.REPEATED: "copies of the one before them"}
+REMEDY = "Copy them again from their source and reconstruct again."
 
-CODES = frozenset(f"{reason}-images" for reason in LeftOut)
+# Images that are those before them are not among these: the preflight looks at all images for them.
+CODES = frozenset(f"{reason}-images" for reason in INCOMPLETE)
 
 
 def sample_findings(why: Mapping[str, LeftOut], looked_at: int) -> list[Finding]:
@@ -37,12 +31,12 @@ def sample_findings(why: Mapping[str, LeftOut], looked_at: int) -> list[Finding]
 
 
 def left_out_findings(why: Mapping[str, LeftOut], images: int) -> list[Finding]:
-    """Findings about the images, by file, that a reconstruction of so many left out."""
+    """Findings about the incomplete images, by file, among so many of a reconstruction."""
     return [
         warning(
             f"{reason}-images",
-            f"{len(files)} of {images} images are {_STATES[reason]} and left out: {listed(files, NAMED)}",
-            _REMEDIES[reason],
+            f"{len(files)} of {images} images are {reason} and left out: {listed(files, NAMED)}",
+            REMEDY,
         )
         for reason, files in _by_reason(why).items()
     ]
@@ -50,7 +44,7 @@ def left_out_findings(why: Mapping[str, LeftOut], images: int) -> list[Finding]:
 
 def nothing_left(why: Mapping[str, LeftOut]) -> InputError:
     """The error where all images, by file, were left out."""
-    reasons = " or ".join(_STATES[reason] for reason in _by_reason(why))
+    reasons = " or ".join(_by_reason(why))
     return InputError(
         f"all {len(why)} images of the drive are {reasons}: {listed(list(why))}",
         remedy="Copy the drive's images again from their source.",
@@ -61,5 +55,6 @@ def nothing_left(why: Mapping[str, LeftOut]) -> InputError:
 def _by_reason(why: Mapping[str, LeftOut]) -> dict[LeftOut, list[str]]:
     found: dict[LeftOut, list[str]] = {}
     for file, reason in why.items():
-        found.setdefault(reason, []).append(file)
+        if reason in INCOMPLETE:
+            found.setdefault(reason, []).append(file)
     return found

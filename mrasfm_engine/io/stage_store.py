@@ -38,21 +38,21 @@ def fingerprint(*parts: object) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def drive_fingerprint(drive: Drive, content_sha256: Mapping[str, str] | None, *, threads: int) -> str:
-    """Hash the manifest and the contents of all images and masks.
+def content_sha256_of(drive: Drive, *, threads: int) -> dict[str, str]:
+    """Read all images and masks of a drive: their SHA-256 by their names in the manifest."""
+    names = _files(drive)
+    with ThreadPoolExecutor(threads) as pool:
+        return dict(zip(names, pool.map(lambda name: _content_sha256(drive.root / name), names), strict=True))
 
-    Parameters
-    ----------
-    content_sha256
-        SHA-256 of the files by their names in the manifest, where the caller knows them; else the files are read.
-    """
-    names = [name for image in drive.images for name in (image.file, image.mask) if name is not None]
-    if content_sha256 is None:
-        with ThreadPoolExecutor(threads) as pool:
-            digests = list(pool.map(lambda name: _content_sha256(drive.root / name), names))
-    else:
-        digests = [content_sha256[name] for name in names]
-    return fingerprint(drive.manifest.model_dump(mode="json"), list(zip(names, digests, strict=True)))
+
+def drive_fingerprint(drive: Drive, content_sha256: Mapping[str, str]) -> str:
+    """Hash the manifest and the contents of all images and masks, given by their SHA-256 by name."""
+    contents = [(name, content_sha256[name]) for name in _files(drive)]
+    return fingerprint(drive.manifest.model_dump(mode="json"), contents)
+
+
+def _files(drive: Drive) -> list[str]:
+    return [name for image in drive.images for name in (image.file, image.mask) if name is not None]
 
 
 def _content_sha256(path: Path) -> str:

@@ -62,7 +62,7 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
                 "units-without-pose",
                 f"{int(lost.sum())} of {len(lost)} units have no pose: {_in_words(drive, spans(lost))}",
                 "units_not_registered in report.json has the reason of each. Look at their images (dark, covered, "
-                "without texture?).",
+                "without texture, left out?).",
             )
         )
     return result

@@ -22,7 +22,7 @@ from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.row_bands import RowBands
-from mrasfm_engine.types import Ints
+from mrasfm_engine.types import Bools, Ints
 from schemas.findings import Finding, warning
 
 # At two sigmas of more a lane of 3.5 m is a third of a metre wider or narrower, and is taken for another kind of lane.
@@ -84,6 +84,9 @@ def _why_missing(mapper: Mapper, log: MappingLog, unit: int, keypoints: int) -> 
     if unit in log.failures:
         return log.failures[unit].reason
     least = mapper.config.mapping.min_pnp_inliers
+    images = mapper.image_unit == unit
+    if images.any() and mapper.missing[images].all():
+        return "its images are left out: truncated, corrupt, or those before them once more"
     if keypoints < least:
         return f"its images have {keypoints} keypoints, {least} are needed"
     return "it sees no point of the scene"
@@ -105,19 +108,40 @@ def _covered(mapper: Mapper, log: MappingLog) -> list[dict[str, Any]]:
 
 def covered_camera_findings(mapper: Mapper, log: MappingLog) -> list[Finding]:
     """Findings on cameras most of whose images contradict the poses of their units, all along the drive."""
-    names = [camera.name for camera in mapper.drive.cameras]
-    camera_of = np.array([image.camera for image in mapper.drive.images], dtype=np.int64)
-    posed = np.bincount(camera_of[mapper.registered[mapper.image_unit]], minlength=len(names))
-    covered = np.bincount(camera_of[sorted(log.covered_images)], minlength=len(names))
+    is_covered = np.zeros(len(mapper.image_unit), dtype=np.bool_)
+    is_covered[sorted(log.covered_images)] = True
     return [
         warning(
             "camera-against-rig",
-            f"{covered[c]} of {posed[c]} images of camera {names[c]} contradict the poses of the vehicle",
+            f"{found} of {posed} images of camera {name} contradict the poses of the vehicle",
             "They have no part in the scene. Look at them: something may cover them, they may be another camera's, or "
             "rig_from_cam may be.",
         )
-        for c in np.flatnonzero((posed >= MIN_UNITS_AGAINST) & (covered > MOST_IMAGES * posed)).tolist()
+        for name, found, posed in _cameras_all_along(mapper, is_covered)
     ]
+
+
+def idle_camera_findings(mapper: Mapper) -> list[Finding]:
+    """Findings on cameras most of whose images observe hardly anything of the finished scene, all along the drive."""
+    return [
+        warning(
+            "camera-without-points",
+            f"{found} of {posed} images of camera {name} observe hardly a point of the scene",
+            "They have no part in the scene. Look at them: they may be dark or without texture, they may be another "
+            "camera's, or rig_from_cam or params may be.",
+        )
+        for name, found, posed in _cameras_all_along(mapper, _is_poorly_seen(mapper))
+    ]
+
+
+def _cameras_all_along(mapper: Mapper, images: Bools) -> list[tuple[str, int, int]]:
+    """Cameras of which most posed images are among some (i,): name, number of these, and of all that are posed."""
+    names = [camera.name for camera in mapper.drive.cameras]
+    camera_of = np.array([image.camera for image in mapper.drive.images], dtype=np.int64)
+    is_posed = mapper.registered[mapper.image_unit] & ~mapper.missing
+    posed, found = (np.bincount(camera_of[rows], minlength=len(names)) for rows in (is_posed, is_posed & images))
+    all_along = (posed >= MIN_UNITS_AGAINST) & (found > MOST_IMAGES * posed)
+    return [(names[c], int(found[c]), int(posed[c])) for c in np.flatnonzero(all_along).tolist()]
 
 
 def _focal_lengths(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
@@ -327,10 +351,14 @@ def scale_findings(refinement: Refinement) -> list[Finding]:
 def _poorly_seen(mapper: Mapper) -> list[str]:
     """Images that observe too little to be registered alone: dark, without texture, or occluded."""
     images = mapper.drive.images
-    counts = np.bincount(mapper.keypoints.image[mapper.is_inlier], minlength=len(images))
-    posed = mapper.registered[mapper.image_unit] & ~mapper.missing
-    poor = np.flatnonzero(posed & (counts < MIN_CAMERA_MATCHES))
-    return [images[i].file for i in poor]
+    return [images[i].file for i in np.flatnonzero(_is_poorly_seen(mapper))]
+
+
+def _is_poorly_seen(mapper: Mapper) -> Bools:
+    """Posed images (i,) that observe too little to be registered alone."""
+    counts = np.bincount(mapper.keypoints.image[mapper.is_inlier], minlength=len(mapper.image_unit))
+    result: Bools = mapper.registered[mapper.image_unit] & ~mapper.missing & (counts < MIN_CAMERA_MATCHES)
+    return result
 
 
 def _scale_source(mapper: Mapper, refinement: Refinement) -> str:

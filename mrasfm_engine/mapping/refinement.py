@@ -223,6 +223,13 @@ def refine(
         if mapper.config.mapping.semantic_triangulation:
             result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
         result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
+        if not mapper.registered.any():
+            raise ReconstructionError(
+                "adjusted together, no unit keeps enough of what it observes: images contradict one another, the rig, "
+                "or positions",
+                remedy="Check the times of images and positions, and rig.cameras.",
+                code="contradictory-drive",
+            )
         result.observations_dropped += observations
         result.points_dropped += points
         done += 1

@@ -10,7 +10,7 @@ prior trajectory shows motion no image is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
@@ -23,7 +23,6 @@ from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.features.extraction import one_opencv_thread
 from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.io.images import check_image_header
-from mrasfm_engine.io.repeated_images import repeated_images
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.matching.small_image_motion import small_images, unit_motion_px
 from mrasfm_engine.scene.drive import Drive, DriveImage
@@ -63,35 +62,43 @@ class Standing:
 
 
 def find_standing(
-    drive: Drive, prior: PriorTrajectory, *, min_motion_px: float, threads: int, cancel: Cancel | None = None
+    drive: Drive,
+    prior: PriorTrajectory,
+    *,
+    min_motion_px: float,
+    repeated: Collection[str] = (),
+    threads: int,
+    cancel: Cancel | None = None,
 ) -> Standing:
     """Find the units that moved less than `min_motion_px`, in pixels of full images.
 
     A drive without any motion keeps all units, as mapping does. Units with an image that is missing or ends early are
-    not left out, nor any with one that is looked at and cannot be read: the extraction says what is wrong with it. Nor
-    are units whose images are all those before them once more, which say nothing of the vehicle.
+    not left out, nor any with one that is looked at and cannot be read: the extraction says what is wrong with it.
+
+    Files that are `repeated` say nothing of the vehicle. Units without others stand if the next unit that has any does.
 
     Raises
     ------
     CancelledError
         Where `cancel` answers True.
     """
-    of_unit = _by_unit(drive)
-    moves = moving_by_prior(drive, prior) | _repeats(drive)
+    moves, of_unit = moving_by_prior(drive, prior), _by_unit(drive)
+    tells = np.array([not images or any(i.file not in repeated for i in images) for images in of_unit])
     # A standing unit is compared with one before it: the last that moves is read as well.
-    wanted = np.flatnonzero(~moves | np.append(~moves[1:], False))
+    telling = np.flatnonzero(tells)
+    wanted = telling[~moves[telling] | np.append(~moves[telling[1:]], False)]
 
     def small(place: int) -> dict[int, Floats32]:
         if cancel is not None and cancel():
             raise CancelledError
-        return small_images(drive, of_unit[wanted[place]])
+        return small_images(drive, [image for image in of_unit[wanted[place]] if image.file not in repeated])
 
     def are_whole(units: Ints) -> bool:
         return all(is_whole(drive.root / image.file) for unit in units for image in of_unit[unit])
 
     last = _LastMoved(moves, _PriorWay.from_prior(drive, prior), min_motion_px)
     stands, moved_px = np.zeros(len(moves), dtype=np.bool_), np.full(len(moves), np.nan)
-    following = _following(drive.timestamps_us[wanted], wanted, moves)
+    following = _following(drive.timestamps_us[wanted], np.searchsorted(telling, wanted), moves[wanted])
     place, one_by_one = 0, 1  # in `wanted`: of the first unit that is not judged, and until where none goes unread
     with one_opencv_thread(), closing(_ReadAhead(threads, small)) as images:
         while place < len(wanted):
@@ -111,10 +118,18 @@ def find_standing(
                 last.unit, last.images = unit, now
             place = looked_at + 1
             images.forget(place)
+    _judge_by_next(stands, moved_px, tells=tells, moves=moves)
     included = ~(stands & np.append(stands[1:], False))  # the last one of a stop is included
     if stands.sum() >= len(stands) - 1:
         included[:] = True
     return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=len(images.asked))
+
+
+def _judge_by_next(stands: Bools, moved_px: Floats, *, tells: Bools, moves: Bools) -> None:
+    """Judge units (u,) that tell nothing by the next one that does: where that stands, nothing moved before it."""
+    for unit in np.flatnonzero(~tells)[::-1].tolist():
+        if unit + 1 < len(stands) and not moves[unit]:
+            stands[unit], moved_px[unit] = stands[unit + 1], moved_px[unit + 1]
 
 
 def is_whole(path: Path) -> bool:
@@ -173,14 +188,14 @@ def _upcoming(place: int, following: Sequence[int], *, standing: bool) -> Iterat
         yield place
 
 
-def _following(times_us: Ints, units: Ints, moves: Bools) -> list[int]:
-    """The place that is looked at after each place of `units` while the car stands: the next one or a farther one.
+def _following(times_us: Ints, number: Ints, moves: Bools) -> list[int]:
+    """The place that is looked at after each of some places while the car stands: the next one or a farther one.
 
-    Between the two lie units of the drive that follow one another, of which none moves by the prior, and no more time
-    than may go unread.
+    Between the two lie units that follow one another by their `number`, of which none moves by the prior, and no more
+    time than may go unread.
     """
-    count = len(units)
-    ends = np.append(np.flatnonzero((np.diff(units) > 1) | moves[units[1:]]), count - 1)
+    count = len(number)
+    ends = np.append(np.flatnonzero((np.diff(number) > 1) | moves[1:]), count - 1)
     end = ends[np.searchsorted(ends, np.arange(count))]
     in_time = np.searchsorted(times_us, times_us + round(UNREAD_S * 1e6), side="right") - 1
     result: list[int] = np.maximum(np.minimum(in_time, end), np.arange(count) + 1).tolist()
@@ -242,14 +257,6 @@ class _PriorWay:
         """Answer `moved` for two units of which the prior knows something."""
         units = np.array([unit_a, unit_b])
         return bool(self.known[units].all() and self.moved(self.times_s[units[:1]], self.times_s[units[1:]])[0])
-
-
-def _repeats(drive: Drive) -> Bools:
-    """Units (u,) that have images, of which none is another one than before."""
-    own, unit = np.ones(len(drive.timestamps_us), dtype=np.bool_), [image.unit for image in drive.images]
-    own[unit] = False
-    own[np.array(unit, dtype=np.int64)[~repeated_images(drive)]] = True
-    return ~own
 
 
 def _by_unit(drive: Drive) -> list[list[DriveImage]]:

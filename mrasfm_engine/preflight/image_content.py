@@ -21,7 +21,7 @@ from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_gray
 from mrasfm_engine.io.left_out_images import sample_findings
-from mrasfm_engine.io.repeated_images import have_same_bytes
+from mrasfm_engine.io.repeated_images import have_same_contents
 from mrasfm_engine.preflight.drive_check import check_drive, is_sound
 from mrasfm_engine.scene.drive import Drive, DriveImage, LeftOut
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Floats32
@@ -268,8 +268,8 @@ def _is_blurred_camera(camera: int, detail: dict[int, float], fineness: dict[int
 def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss: bool) -> list[Finding]:
     still: dict[tuple[int, int], list[bool]] = {}  # by the two units: of every camera with enough contrast
     # An image that is another once more says nothing of the vehicle.
-    differing = [(a, b) for a, b in pairs if not have_same_bytes(drive, a.image.file, b.image.file)]
-    for a, b in differing or pairs:
+    telling = [(a, b) for a, b in pairs if not have_same_contents(drive.root / a.image.file, drive.root / b.image.file)]
+    for a, b in telling or pairs:
         verdict = _is_still(a.small, b.small)
         if verdict is not None:
             still.setdefault((a.image.unit, b.image.unit), []).append(verdict)
@@ -285,8 +285,8 @@ def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss
                 "Give the part of the recording in which the vehicle drives: structure comes from motion.",
             )
         ]
-    share = len(standing) / len(still)
-    if share < MIN_STILL_SHARE:
+    share = len(standing) / len({(a.image.unit, b.image.unit) for a, b in pairs})
+    if not telling or share < MIN_STILL_SHARE:
         return []
     where = [f"frames.{a} to frames.{b}" for a, b in standing]
     return [

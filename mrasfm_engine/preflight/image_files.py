@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import groupby
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
 from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
-from mrasfm_engine.io.left_out_images import REPEATED_REMEDY
-from mrasfm_engine.io.repeated_images import repeated_images
+from mrasfm_engine.io.repeated_images import runs_of_same_images
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import CountProgress
 from schemas.findings import Finding, Severity, error, listed, warning
@@ -37,7 +35,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         Called with how many of how many images are checked.
     """
     findings: list[Finding] = []
-    paths = _PathCheck(drive.root)
+    paths, sound = _PathCheck(drive.root), list[DriveImage]()
     oddities: dict[str, list[str]] = {code: [] for code in _GROUPED}
     # One mask may serve many images, as that of the own car's body.
     masks = list({(i.mask, i.camera): i for i in drive.images if i.mask is not None}.values())
@@ -49,6 +47,8 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         findings += found_here
         for code in codes:
             oddities[code].append(image.file)
+        if not found_here:
+            sound.append(image)
         if progress is not None:
             progress(done, total)
     with ThreadPoolExecutor(MASK_THREADS) as pool:
@@ -60,7 +60,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         if oddities[code]:
             files = oddities[code]
             findings.append(warning(code, f"{len(files)} images {state}: {listed(files)}", remedy))
-    return [*_gather(findings), *_repeated(drive), *_unlisted(drive)]
+    return [*_gather(findings), *_repeated(drive, sound), *_unlisted(drive)]
 
 
 class _PathCheck:
@@ -88,20 +88,20 @@ class _PathCheck:
             return False
 
 
-def _repeated(drive: Drive) -> Iterator[Finding]:
+def _repeated(drive: Drive, images: Sequence[DriveImage]) -> Iterator[Finding]:
     """One finding of every camera with images that are those before them."""
-    is_repeated = repeated_images(drive)
+    runs = runs_of_same_images(drive.root, images)
     for camera, given in enumerate(drive.cameras):
-        of_camera = [i for i, image in enumerate(drive.images) if image.camera == camera]
-        runs = [list(run) for is_copy, run in groupby(of_camera, key=is_repeated.__getitem__) if is_copy]
-        if not runs:
+        copies = [run[1:] for run in runs if run[0].camera == camera]
+        if not copies:
             continue
-        files = [drive.images[i].file for run in runs for i in run]
+        files = [image.file for run in copies for image in run]
         yield warning(
             "repeated-images",
             f"{len(files)} images of camera {given.name} are copies of the one before them, "
-            f"up to {max(map(len, runs))} in a row: {listed(files)}",
-            REPEATED_REMEDY,
+            f"up to {max(map(len, copies))} in a row: {listed(files)}",
+            "Nothing needs to be done where a log has images twice. A camera, or what records it, that gets no new "
+            "image repeats its last one: copies are left out, and what has no other images has no pose.",
         )
 
 

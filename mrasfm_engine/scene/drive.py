@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -36,11 +35,14 @@ def pose_from_matrix(a_from_b: Floats) -> Pose:
 
 
 class LeftOut(StrEnum):
-    """Reason for not using an image that can be decoded, at least in part."""
+    """Reason for not using an image of which all or some pixels are there."""
 
     TRUNCATED = "truncated"
     CORRUPT = "corrupt"
     REPEATED = "repeated"  # the one before it once more
+
+
+INCOMPLETE = frozenset({LeftOut.TRUNCATED, LeftOut.CORRUPT})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,16 +61,10 @@ class Drive:
     """A recorded drive that can be reconstructed.
 
     `manifest.rig.body_axes` is always `flu`: readers convert other axes once, when they load.
-
-    Attributes
-    ----------
-    before
-        Of a part of a drive: each camera's last image file before it, by the camera's name.
     """
 
     root: Path
     manifest: DriveManifest
-    before: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -78,10 +74,7 @@ class Drive:
     def restricted_to(self, units: Bools) -> Drive:
         """The drive of some of its units (units,) alone."""
         frames = [frame for frame, is_wanted in zip(self.manifest.frames, units.tolist(), strict=True) if is_wanted]
-        before = dict(self.before)
-        for frame in self.manifest.frames[: int(np.argmax(units))]:
-            before |= {name: image.file for name, image in frame.images.items()}
-        return Drive(self.root, self.manifest.model_copy(update={"frames": frames}), before)
+        return Drive(self.root, self.manifest.model_copy(update={"frames": frames}))
 
     @cached_property
     def images(self) -> list[DriveImage]:

@@ -31,7 +31,7 @@ class ImageFeatures:
     classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where no network ran
     made_mask: Bytes | None = None
-    # of an image without keypoints that takes no part, as its pixels are not all there
+    # reason for an image without keypoints that takes no part
     left_out: LeftOut | None = None
 
     def __post_init__(self) -> None:

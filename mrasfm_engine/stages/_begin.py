@@ -90,6 +90,7 @@ def probe(run: Run) -> None:
         segmenter=run.components.segmenter,
         class_margin_px=run.config.features.class_margin_px,
         own_cars=run.own_cars,
+        repeated=run.repeated,
         cancel=run.cancel,
     )
     run.probed = {

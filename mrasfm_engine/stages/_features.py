@@ -49,6 +49,7 @@ def extract(run: Run) -> tuple[StoredFeatures, dict[str, Any]]:
             segmenter=run.components.segmenter,
             class_margin_px=run.config.features.class_margin_px,
             own_cars=run.own_cars,
+            repeated=run.repeated,
             known=run.probed,
             progress=run.step(Stage.FEATURES),
             cancel=run.cancel,

@@ -151,6 +151,7 @@ def _refined(
     if refined.wrong_pair is not None:
         names = [camera.name for camera in run.drive.cameras]
         findings.append(miscalibration.pair_finding(names, refined.wrong_pair))
+    findings += mapping_report.idle_camera_findings(mapper)
     findings += mapping_report.motion_findings(mapper)
     findings += mapping_report.scale_findings(refined)
     report = {

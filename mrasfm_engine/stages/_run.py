@@ -15,7 +15,16 @@ from mrasfm_engine.errors import CancelledError, StorageError
 from mrasfm_engine.features.extraction import Extractor
 from mrasfm_engine.features.extraction_size import Size, at_sizes
 from mrasfm_engine.freed_memory import return_freed_memory
-from mrasfm_engine.io.stage_store import Arrays, StageStore, StageWriter, StoredStage, drive_fingerprint, fingerprint
+from mrasfm_engine.io.repeated_images import repeated_images
+from mrasfm_engine.io.stage_store import (
+    Arrays,
+    StageStore,
+    StageWriter,
+    StoredStage,
+    content_sha256_of,
+    drive_fingerprint,
+    fingerprint,
+)
 from mrasfm_engine.matching.standing import Standing
 from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.scene.drive import Drive
@@ -66,9 +75,10 @@ class Run:
         """The extractor at the sizes that were found."""
         return at_sizes(self.components.extractor, self.side_px)
 
-    def share_models(self, other: Run) -> None:
-        """Use the models that another run with the same settings has loaded, or will load."""
+    def share(self, other: Run) -> None:
+        """Use what another run of the drive with the same settings has loaded, or will load, and knows of its files."""
         self.__dict__["components"] = other.components
+        self.__dict__["repeated"] = other.repeated
 
     @property
     def feature_settings(self) -> object:
@@ -122,7 +132,19 @@ class Run:
     @cached_property
     def drive_key(self) -> str:
         """Fingerprint of the drive's manifest and files."""
-        return drive_fingerprint(self.drive, self.content_sha256, threads=self.config.threads)
+        return drive_fingerprint(self.drive, self.contents)
+
+    @cached_property
+    def contents(self) -> Mapping[str, str]:
+        """SHA-256 of the drive's files by name."""
+        if self.content_sha256 is not None:
+            return self.content_sha256
+        return content_sha256_of(self.whole_drive or self.drive, threads=self.config.threads)
+
+    @cached_property
+    def repeated(self) -> frozenset[str]:
+        """Files of images that are those before them once more, also before units that are left out."""
+        return repeated_images(self.whole_drive or self.drive, self.contents)
 
     def next_key(self, stage: Stage, settings: object) -> str:
         """The fingerprint of a stage that follows those done so far."""

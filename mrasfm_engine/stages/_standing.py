@@ -36,6 +36,7 @@ def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:
             run.drive,
             known,
             min_motion_px=run.config.mapping.keyframe_motion_px,
+            repeated=run.repeated,
             threads=run.config.threads,
             cancel=run.cancel,
         )

@@ -49,13 +49,13 @@ class SubmapRun:
             side_px=run.side_px,
             key=fingerprint(run.key or run.drive_key, SUBMAPS, asdict(span)),
         )
-        self.run.share_models(run)
+        self.run.share(run)
 
     @cached_property
     def is_finished(self) -> bool:
         """True where its last stage is in the store."""
         last = replace(self.run)
-        last.share_models(self.run)
+        last.share(self.run)
         last.key = last.next_key(Stage.FEATURES, last.feature_settings)
         last.key = last.next_key(Stage.MATCHES, match_settings(last))
         return last.store.has(Stage.MAPPING, last.next_key(Stage.MAPPING, mapping_settings(last)))

@@ -14,6 +14,7 @@ import pytest
 from mrasfm_engine.config import EngineConfig, OutputConfig, SubmapConfig
 from mrasfm_engine.errors import StorageError
 from mrasfm_engine.features.sift import SiftExtractor
+from mrasfm_engine.io.stage_store import content_sha256_of
 from mrasfm_engine.pipeline import plan_submaps, reconstruct, reconstruct_submap
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -84,7 +85,7 @@ def test_the_report_has_every_sub_map(drive: Path, scene: Path) -> None:
 def test_sub_maps_that_others_have_done_are_not_done_again(drive: Path, scene: Path, tmp_path: Path) -> None:
     """As workers do them: each has its own files alone, and what the plan left."""
     out, seen = tmp_path / "scene", list[tuple[str, int, int]]()
-    contents = dict.fromkeys((file for image in read_drive(drive).images for file in (image.file,)), "sha")
+    contents = content_sha256_of(read_drive(drive), threads=1)
     planned = plan_submaps(drive, out, CONFIG, workers=3, content_sha256=contents)
     assert [(one.number, one.first_unit, one.last_unit) for one in planned] == [(1, 0, 6), (2, 4, 10), (3, 8, 14)]
     assert not any(one.is_finished for one in planned)

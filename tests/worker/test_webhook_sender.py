@@ -237,18 +237,20 @@ def test_an_address_that_hangs_holds_up_its_own_messages_alone(
     project_id = registered(database, settings, hanging.url).project_id
     for _ in range(5):
         registered(database, settings, receiver.url)
-    sending = threading.Thread(target=WebhookSender(settings, database).send_due, daemon=True)
+    sending = threading.Thread(target=WebhookSender(settings, database).send_due)
     sending.start()
-    wait_until(lambda: len(receiver.got) == 5, "the others", within_s=20)
-    with database.write() as session:
-        asked = WebhookRequest(url=receiver.url)
-        webhooks.create(session, project_id=project_id, asked=asked, allow_private=True)
-        job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
-        jobs.request_cancel(session, job.id)
-    wait_until(lambda: len(receiver.got) == 6, "what becomes due meanwhile", within_s=20)
-    assert len(hanging.got) == 1
-    hanging.close()
-    sending.join(20)
+    try:
+        wait_until(lambda: len(receiver.got) == 5, "the others", within_s=20)
+        with database.write() as session:
+            asked = WebhookRequest(url=receiver.url)
+            webhooks.create(session, project_id=project_id, asked=asked, allow_private=True)
+            job = jobs.create(session, project_id=project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+            jobs.request_cancel(session, job.id)
+        wait_until(lambda: len(receiver.got) == 6, "what becomes due meanwhile", within_s=20)
+        wait_until(lambda: len(hanging.got) == 1, "the message that hangs", within_s=20)
+    finally:
+        hanging.close()
+        sending.join(20)
     assert not sending.is_alive()
 
 
@@ -281,7 +283,10 @@ def test_an_address_that_drips_ends(
     monkeypatch.setattr(webhook_sender, "_WITHIN_S", 0.6)
     registered(database, settings, receiver.url)
     receiver.drips = True  # until the test ends
-    WebhookSender(settings, database).send_due()
+    sending = threading.Thread(target=WebhookSender(settings, database).send_due, daemon=True)
+    sending.start()
+    sending.join(20)
+    assert not sending.is_alive()
     assert delivery_of(database).state == "PENDING"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import StorageError
-from mrasfm_engine.io.stage_store import StageStore, StoredStage, drive_fingerprint, fingerprint
+from mrasfm_engine.io.stage_store import StageStore, StoredStage, content_sha256_of, drive_fingerprint, fingerprint
 from mrasfm_engine.preflight.drive_reader import read_drive
 
 ARRAYS: dict[str, np.ndarray] = {
@@ -218,7 +218,8 @@ def test_fingerprints_tell_inputs_apart() -> None:
 
 
 def of(folder: Path, contents: dict[str, str] | None = None) -> str:
-    return drive_fingerprint(read_drive(folder), contents, threads=2)
+    drive = read_drive(folder)
+    return drive_fingerprint(drive, content_sha256_of(drive, threads=2) if contents is None else contents)
 
 
 def test_the_drives_fingerprint_follows_contents_and_manifest(write_drive: Any, drive_document: Any) -> None:

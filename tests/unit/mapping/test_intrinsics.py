@@ -65,11 +65,24 @@ def test_what_is_not_observed_is_held_and_said(cameras: int) -> None:
     good = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": 0.001})
     mapper.config = mapper.config.model_copy(update={"bundle_adjustment": good})
     found = decide(mapper, simulated)
-    assert (found.sigma_focal > 0.001 / 3).all()
+    assert (found.sigma_focal > 0.001 / 2).all()
     assert not found.free.any()
     said = found.findings(mapper)
     assert [f.code for f in said] == ["focal-not-observed"] * cameras
     assert "prior says 0.10%" in said[0].what
+
+
+def test_half_of_the_prior_is_observed() -> None:
+    """As for directions of the rig."""
+    mapper, simulated = model(straight=False, cameras=2)
+    sigma = decide(mapper, simulated).sigma_focal.max()
+    for times, is_free in ((2.2, True), (1.5, False)):  # of which the posterior is 0.41 and 0.55, were errors the same
+        poor = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": times * float(sigma)})
+        mapper.config = mapper.config.model_copy(update={"bundle_adjustment": poor})
+        found = decide(mapper, simulated)
+        ratio = found.sigma_focal / found.prior_sigma_focal
+        assert ((ratio > 1 / 3) & (ratio < 2 / 3)).all()
+        assert found.free[:, 0].tolist() == [is_free] * 2
 
 
 @pytest.mark.slow
@@ -125,7 +138,7 @@ def test_a_single_camera_on_a_straight_street_says_nothing_and_is_not_certain() 
     assert result.intrinsics is not None
     assert result.intrinsics.findings(mapper) == []
     assert result.certainty is not None
-    assert 0.01 / 3 < result.certainty.sigma_camera[0, 6] <= 0.0101
+    assert 0.01 / 2 < result.certainty.sigma_camera[0, 6] <= 0.0101
 
 
 def test_leaving_the_prior_is_a_finding() -> None:

@@ -12,7 +12,7 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
 from mrasfm_engine.mapping.initialization import UnitScores, initialise
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.mapping_report import covered_camera_findings, describe
+from mrasfm_engine.mapping.mapping_report import covered_camera_findings, describe, idle_camera_findings
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement import refine
 from tests.helpers.simulated_drive import (
@@ -347,3 +347,17 @@ def test_a_camera_whose_images_contradict_the_vehicle_all_along_is_a_finding() -
     assert f"7 of 8 images of camera {name}" in finding.what
     # A lorry beside the vehicle for half of the drive is none.
     assert covered_camera_findings(mapper, MappingLog(covered_images=dict.fromkeys(of_camera[:4], 0.9))) == []
+
+
+def test_a_camera_that_observes_hardly_a_point_all_along_is_a_finding() -> None:
+    simulated = make_simulated_drive(units=8, cameras=3, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(8))
+    mapper.complete()
+    assert idle_camera_findings(mapper) == []
+    of_camera = [i for i, image in enumerate(simulated.drive.images) if image.camera == 1]
+    mapper.is_inlier &= ~np.isin(mapper.keypoints.image, of_camera[:7])
+    (finding,) = idle_camera_findings(mapper)
+    assert finding.code == "camera-without-points"
+    assert f"of 8 images of camera {simulated.drive.cameras[1].name} observe" in finding.what
+    mapper.missing[of_camera] = True  # images that are left out have findings of their own
+    assert idle_camera_findings(mapper) == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -88,22 +88,30 @@ def test_jpegs_in_colour_with_noise_of_each_channel(tmp_path: Path) -> None:
     assert found.moved_px[~found.included].max() < 0.5, "noise is no motion"
 
 
-def test_images_that_are_those_before_once_more_do_not_stand(tmp_path: Path) -> None:
-    """What records them hangs, and says nothing of the car; one camera that hangs does not hide a stop."""
-    drive = write(tmp_path / "all", 11, lambda unit, camera: view(camera, 25.0 * unit), cameras=2)
-    hang(drive, range(3, 8), cameras=2)
-    assert standing_of(drive).included.all()
-    drive = write(tmp_path / "one", 11, lambda unit, camera: view(camera, stop_px(unit)), cameras=2)
-    hang(drive, range(3, 8), cameras=1)
-    assert standing_of(drive).spans() == [(2, 7)]
+def files_of(drive: Drive, units: Iterable[int], cameras: int) -> set[str]:
+    """Files of the first cameras in some units."""
+    return {image.file for image in drive.images if image.unit in units and image.camera < cameras}
 
 
-def hang(drive: Drive, units: range, cameras: int) -> None:
-    """Images of the first cameras in some units become the last ones before these."""
-    for camera in range(cameras):
-        file = {image.unit: drive.root / image.file for image in drive.images if image.camera == camera}
-        for unit in units:
-            file[unit].write_bytes(file[units[0] - 1].read_bytes())
+@pytest.mark.parametrize(("cameras", "hung"), [(1, 1), (2, 1), (2, 2), (3, 2)])
+def test_images_that_are_those_before_once_more_do_not_stand(tmp_path: Path, cameras: int, hung: int) -> None:
+    """What records them hangs, and says nothing of the vehicle."""
+    shown = [unit if unit < 3 or unit > 7 else 2 for unit in range(11)]
+    drive = write(tmp_path, 11, lambda unit, k: view(k, 25.0 * (shown[unit] if k < hung else unit)), cameras)
+    repeated = files_of(drive, range(3, 8), hung)
+    assert find_standing(drive, NO_PRIOR, min_motion_px=MIN_MOTION_PX, repeated=repeated, threads=2).included.all()
+    assert (not standing_of(drive).included.all()) == (2 * hung >= cameras), "which nobody else would tell"
+
+
+@pytest.mark.parametrize("units", [[5], [3, 4, 5, 6], [7], [2, 4, 6, 8], range(8, 11)])
+def test_units_without_images_of_their_own_stand_where_the_next_one_does(tmp_path: Path, units: Iterable[int]) -> None:
+    drive = write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit)))
+    repeated = files_of(drive, units, 1)
+    found = find_standing(drive, NO_PRIOR, min_motion_px=MIN_MOTION_PX, repeated=repeated, threads=2)
+    shown = [unit for unit in range(2, 8) if unit not in units]
+    assert found.spans() == [(shown[0], shown[-1])]
+    assert not np.isnan(found.moved_px[~found.included]).any()
+    assert found.moved_px[~found.included].max() < 0.5
 
 
 def test_grey_images_do_not_stand(tmp_path: Path) -> None:

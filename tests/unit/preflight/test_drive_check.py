@@ -244,6 +244,18 @@ def test_unsynchronised_image(drive_document: Document, write_drive: WriteDrive)
     assert "images/right/000002.png with 61 ms" in finding.what
 
 
+@pytest.mark.parametrize("late_us", [250_000, -250_000])
+def test_images_of_other_frames(drive_document: Document, write_drive: WriteDrive, late_us: int) -> None:
+    """Of a camera that is synchronous to none of its frames, but to others."""
+    for frame in drive_document["frames"]:
+        frame["images"]["left"]["timestamp_us"] = frame["timestamp_us"] + late_us
+    root = write_drive(drive_document)
+    (finding,) = findings(root, use_gnss=False)["unsynchronised"]
+    assert finding.severity == Severity.ERROR
+    assert "5 images are over 60 ms" in finding.what
+    assert "most images of camera left have other frames between" in finding.what
+
+
 def test_one_camera_needs_another_scale(drive_document: Document, write_drive: WriteDrive) -> None:
     drive_document["rig"]["cameras"] = drive_document["rig"]["cameras"][:1]
     for frame in drive_document["frames"]:
