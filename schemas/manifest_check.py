@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import resource
 import sys
-from collections import Counter
+from bisect import bisect_left, bisect_right
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -141,27 +142,27 @@ def _check_times(recorded: _Recorded) -> list[Finding]:
 
 def _check_synchronisation(recorded: _Recorded) -> list[Finding]:
     """Find images far from their frame's time, and cameras most of whose images belong to other frames."""
-    times_us = recorded.timestamps_us
     off: list[tuple[int, str]] = []
-    images, elsewhere = Counter[str](), Counter[str]()
+    frames_us, elsewhere = defaultdict[str, list[int]](list), Counter[str]()
+    for camera, _, _, of_frame in recorded.images:
+        frames_us[camera].append(of_frame)
     for camera, file, own, of_frame in recorded.images:
-        images[camera] += 1
         if abs(own - of_frame) <= MAX_UNSYNCHRONISED_US:
             continue
         off.append((abs(own - of_frame), file))
         first, last = sorted((own, of_frame))
-        lies_between = np.searchsorted(times_us, last, "left") > np.searchsorted(times_us, first, "right")
-        elsewhere[camera] += bool(lies_between)
+        # Frames without an image of this camera are those of faster ones.
+        elsewhere[camera] += bisect_left(frames_us[camera], last) > bisect_right(frames_us[camera], first)
     if not off:
         return []
-    lost = [camera for camera, count in elsewhere.items() if 2 * count > images[camera]]
+    lost = [camera for camera, count in elsewhere.items() if 2 * count > len(frames_us[camera])]
     most_us, file = max(off)
     what = (
         f"{len(off)} images are over {MAX_UNSYNCHRONISED_US // 1000} ms from their frame's time, most {file} with "
         f"{most_us / 1000:.0f} ms"
     )
     if lost:
-        what += f"; most images of camera {listed(lost)} have other frames between"
+        what += f"; between most images of {listed(lost)} and their frames lie other frames with images of theirs"
     remedy = "Put images into the frame that is nearest in time; times of frames and of images are on one clock."
     return [(error if lost else warning)("unsynchronised", what, remedy)]
 

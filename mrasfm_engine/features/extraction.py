@@ -210,13 +210,9 @@ def features_by_image(
         classes = classes_at(confident_classes(masked.codes, class_margin_px), found.xy_px)
         return replace(found, classes=classes, made_mask=made_mask)
 
-    count, before = len(drive.images), dict[int, LeftOut | None]()
+    count = len(drive.images)
     with one_opencv_thread():
         for done, found in enumerate(in_order(threads, one, range(count)), 1):
-            camera = drive.images[done - 1].camera
-            if found == LeftOut.REPEATED:  # of what is truncated or corrupt, a copy is no better
-                found = before.get(camera) or LeftOut.REPEATED
-            before[camera] = found if isinstance(found, LeftOut) else None
             yield found
             if progress is not None:
                 progress(done, count)

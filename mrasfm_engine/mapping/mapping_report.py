@@ -122,15 +122,17 @@ def covered_camera_findings(mapper: Mapper, log: MappingLog) -> list[Finding]:
 
 
 def idle_camera_findings(mapper: Mapper) -> list[Finding]:
-    """Findings on cameras most of whose images observe hardly anything of the finished scene, all along the drive."""
+    """Findings on cameras whose images match one another and observe hardly anything of the finished scene."""
+    matched = np.bincount(mapper.keypoints.image, minlength=len(mapper.image_unit)) >= MIN_CAMERA_MATCHES
     return [
         warning(
             "camera-without-points",
-            f"{found} of {posed} images of camera {name} observe hardly a point of the scene",
-            "They have no part in the scene. Look at them: they may be dark or without texture, they may be another "
-            "camera's, or rig_from_cam or params may be.",
+            f"{found} of {posed} images of camera {name} have matches and observe under {MIN_CAMERA_MATCHES} points of "
+            "the scene",
+            "They have hardly any part in the scene. Look at them: they may be another camera's, or rig_from_cam or "
+            "params may be.",
         )
-        for name, found, posed in _cameras_all_along(mapper, _is_poorly_seen(mapper))
+        for name, found, posed in _cameras_all_along(mapper, _is_poorly_seen(mapper) & matched)
     ]
 
 

@@ -223,10 +223,10 @@ def refine(
         if mapper.config.mapping.semantic_triangulation:
             result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
         result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
-        if not mapper.registered.any():
+        if mapper.registered.sum() < 2:
             raise ReconstructionError(
-                "adjusted together, no unit keeps enough of what it observes: images contradict one another, the rig, "
-                "or positions",
+                "adjusted together, no two units keep enough of what they observe: images contradict one another, "
+                "the rig, or positions",
                 remedy="Check the times of images and positions, and rig.cameras.",
                 code="contradictory-drive",
             )

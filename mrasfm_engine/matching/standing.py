@@ -120,7 +120,7 @@ def find_standing(
             images.forget(place)
     _judge_by_next(stands, moved_px, tells=tells, moves=moves)
     included = ~(stands & np.append(stands[1:], False))  # the last one of a stop is included
-    if stands.sum() >= len(stands) - 1:
+    if stands[telling].sum() >= len(telling) - 1:
         included[:] = True
     return Standing(included=included, moved_px=np.where(included, np.nan, moved_px), compared=len(images.asked))
 

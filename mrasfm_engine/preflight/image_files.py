@@ -93,12 +93,13 @@ def _repeated(drive: Drive, images: Sequence[DriveImage]) -> Iterator[Finding]:
     runs = runs_of_same_images(drive.root, images)
     for camera, given in enumerate(drive.cameras):
         copies = [run[1:] for run in runs if run[0].camera == camera]
+        count = sum(image.camera == camera for image in drive.images)
         if not copies:
             continue
         files = [image.file for run in copies for image in run]
         yield warning(
             "repeated-images",
-            f"{len(files)} images of camera {given.name} are copies of the one before them, "
+            f"{len(files)} of {count} images of camera {given.name} are copies of the one before them, "
             f"up to {max(map(len, copies))} in a row: {listed(files)}",
             "Nothing needs to be done where a log has images twice. A camera, or what records it, that gets no new "
             "image repeats its last one: copies are left out, and what has no other images has no pose.",

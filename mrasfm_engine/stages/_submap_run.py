@@ -89,6 +89,8 @@ class SubmapRun:
             except ReconstructionError as problem:
                 return arrays, {"components": [], "reason": str(problem)}
             parts = begun.put_together()
+            for part in parts:
+                part.mapper.missing |= np.array([image.left_out is not None for image in features])
             for number, part in enumerate(parts):
                 arrays |= {f"{number}.{name}": array for name, array in part_arrays(part).items()}
             # What they find, the joined scene finds as well.

@@ -104,7 +104,7 @@ def test_a_unit_that_is_recorded_twice(variant: Variant, mrasfm: Run) -> None:
     report = read_report(variant.scene)
     said = [finding["what"] for finding in report["findings"] if finding["code"] == "repeated-images"]
     assert said == [
-        f"1 images of camera {camera} are copies of the one before them, up to 1 in a row: {file}"
+        f"1 of 6 images of camera {camera} are copies of the one before them, up to 1 in a row: {file}"
         for camera, file in zip(CAMERAS, repeated, strict=True)
     ]
     assert report["by_stage"]["features"]["images_left_out"] == [

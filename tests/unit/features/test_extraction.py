@@ -202,16 +202,6 @@ def test_an_image_that_is_the_one_before_once_more_is_left_out(tmp_path: Path) -
     assert [len(f.xy_px) > 50 for f in found] == [True, False, False]
 
 
-def test_a_copy_of_an_image_of_which_pixels_are_missing_is_no_better(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    drive = make_drive(tmp_path)
-    (tmp_path / "0.png").write_bytes(cut((tmp_path / "0.png").read_bytes()))
-    found = extract_features(drive, SiftExtractor(FeatureConfig()), threads=2, repeated=["1.png"])
-    assert [f.left_out for f in found] == [LeftOut.TRUNCATED, LeftOut.TRUNCATED, None]
-    capfd.readouterr()  # the decoder's own complaint
-
-
 def test_what_is_left_out_has_features_of_the_others_kind(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     class Learned:
         def extract(self, rgb: np.ndarray, mask: np.ndarray | None) -> ImageFeatures:

@@ -326,6 +326,16 @@ def test_local_adjustment_moves_only_what_is_free() -> None:
     assert 0.01 < np.linalg.norm(mapper.state.unit_position_m[3] - before[3]) < 0.06
 
 
+@pytest.mark.parametrize("kept", [0, 1])
+def test_a_drive_of_which_the_adjustment_leaves_nothing_is_an_error(kept: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    _, mapper = posed_model()
+    most = np.sort(np.bincount(mapper.keypoints.unit[mapper.is_inlier]))[-kept - 1]
+    monkeypatch.setattr(mapper, "drop_unsupported", lambda _: Mapper.drop_unsupported(mapper, int(most) + 1 - kept))
+    with pytest.raises(ReconstructionError, match="no two units keep enough") as caught:
+        refine(mapper)
+    assert caught.value.code == "contradictory-drive"
+
+
 def test_clear_forgets_poses_and_points() -> None:
     _, mapper = posed_model()
     assert mapper.visible_counts().min() > 100
@@ -358,6 +368,6 @@ def test_a_camera_that_observes_hardly_a_point_all_along_is_a_finding() -> None:
     mapper.is_inlier &= ~np.isin(mapper.keypoints.image, of_camera[:7])
     (finding,) = idle_camera_findings(mapper)
     assert finding.code == "camera-without-points"
-    assert f"of 8 images of camera {simulated.drive.cameras[1].name} observe" in finding.what
+    assert f"of 8 images of camera {simulated.drive.cameras[1].name} have matches" in finding.what
     mapper.missing[of_camera] = True  # images that are left out have findings of their own
     assert idle_camera_findings(mapper) == []
