@@ -6,12 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mrasfm_engine import stages
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.scene.submaps import Span
 from tests.helpers.damaged_images import cut
 
 WriteDrive = Callable[[dict[str, Any]], Path]
@@ -51,6 +53,18 @@ def test_the_calibrations_check_does_without_images(drive: Path, capfd: pytest.C
     truncate(drive, "*/00000[0-4].png")
     stages.probe(run_of(drive))
     capfd.readouterr()
+
+
+def test_repeated_images_are_those_of_the_whole_drive(drive: Path) -> None:
+    """Also where the unit that is repeated is left out, and for a sub-map that begins after it."""
+    images = drive / "images/left"
+    (images / "000002.png").write_bytes((images / "000001.png").read_bytes())
+    run = run_of(drive)
+    units = np.arange(len(run.drive.timestamps_us))
+    run.whole_drive, run.drive = run.drive, run.drive.restricted_to(units != 1)
+    assert run.repeated == {"images/left/000002.png"}
+    part = stages.SubmapRun(run, Span(number=2, first=1, last=len(units) - 2))
+    assert part.run.repeated is run.repeated
 
 
 def test_findings_of_all_images_take_the_place_of_the_samples(drive: Path, capfd: pytest.CaptureFixture[str]) -> None:
