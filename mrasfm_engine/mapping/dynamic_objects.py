@@ -107,7 +107,7 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
 
 def _flows(mapper: Mapper, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
     """Expected and measured motion, in pixels, of the keypoints of every pair of one camera's images."""
-    posed = mapper.registered[mapper.image_unit] & ~mapper.missing
+    posed = mapper.image_posed
     world_from_cam = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
     world_from_cam = world_from_cam @ mapper.state.rig_from_cam[mapper.image_camera]
 

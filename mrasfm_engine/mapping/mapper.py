@@ -256,6 +256,12 @@ class Mapper:
         cameras = len(self.camera_kind)
         return visibility_score(rows, self._cell, self.keypoints.camera, of_keypoint, self.triangulated, cameras)
 
+    @property
+    def image_posed(self) -> Bools:
+        """Images (i,) that have the pose of a registered unit."""
+        result: Bools = self.registered[self.image_unit] & ~self.missing
+        return result
+
     def triangulate(self, which: Ints | None = None) -> int:
         """Triangulate tracks (all by default) from registered units; how many of them have a point."""
         if which is None:
@@ -263,7 +269,7 @@ class Mapper:
         self.triangulator.triangulate(
             self.state,
             self.tracks,
-            (self.registered[self.image_unit] & ~self.missing)[self.motion.bands.image],
+            self.image_posed[self.motion.bands.image],
             which=which,
             points_m=self.state.points_m,
             triangulated=self.triangulated,

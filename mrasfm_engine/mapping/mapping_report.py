@@ -139,9 +139,10 @@ def idle_camera_findings(mapper: Mapper) -> list[Finding]:
 def _cameras_all_along(mapper: Mapper, images: Bools) -> list[tuple[str, int, int]]:
     """Cameras of which most posed images are among some (i,): name, number of these, and of all that are posed."""
     names = [camera.name for camera in mapper.drive.cameras]
-    camera_of = np.array([image.camera for image in mapper.drive.images], dtype=np.int64)
-    is_posed = mapper.registered[mapper.image_unit] & ~mapper.missing
-    posed, found = (np.bincount(camera_of[rows], minlength=len(names)) for rows in (is_posed, is_posed & images))
+    posed, found = (
+        np.bincount(mapper.image_camera[rows], minlength=len(names))
+        for rows in (mapper.image_posed, mapper.image_posed & images)
+    )
     all_along = (posed >= MIN_UNITS_AGAINST) & (found > MOST_IMAGES * posed)
     return [(names[c], int(found[c]), int(posed[c])) for c in np.flatnonzero(all_along).tolist()]
 
@@ -359,7 +360,7 @@ def _poorly_seen(mapper: Mapper) -> list[str]:
 def _is_poorly_seen(mapper: Mapper) -> Bools:
     """Posed images (i,) that observe too little to be registered alone."""
     counts = np.bincount(mapper.keypoints.image[mapper.is_inlier], minlength=len(mapper.image_unit))
-    result: Bools = mapper.registered[mapper.image_unit] & ~mapper.missing & (counts < MIN_CAMERA_MATCHES)
+    result: Bools = mapper.image_posed & (counts < MIN_CAMERA_MATCHES)
     return result
 
 

@@ -80,7 +80,7 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     tracks = np.flatnonzero(moves)
     points = int(mapper.triangulated[tracks].sum())
     mapper.drop(tracks)
-    posed = np.flatnonzero((mapper.registered[mapper.image_unit] & ~mapper.missing)[mapper.keypoints.image])
+    posed = np.flatnonzero(mapper.image_posed[mapper.keypoints.image])
     of_keypoint = mapper.tracks.of_keypoint[posed]
     seen = np.bincount(of_keypoint[of_keypoint >= 0], minlength=len(mapper.tracks))
     judged = int((may_move & (seen > 1)).sum())
@@ -103,7 +103,7 @@ def views_of(mapper: Mapper) -> Views:
         rotation=rotation,
         translation_m=translation_m,
         time_s=(us[bands.unit] - us[0]) / 1e6 + bands.time_offset_s + state.camera_time_offset_s[bands.camera],
-        is_posed=(mapper.registered[mapper.image_unit] & ~mapper.missing)[bands.image],
+        is_posed=mapper.image_posed[bands.image],
         kind=mapper.camera_kind,
         params=state.camera_params,
         sigma_px=_sigmas_px(mapper),

@@ -61,7 +61,7 @@ def build_scene(
     return Scene(
         drive=mapper.drive,
         unit_registered=mapper.registered.copy(),
-        image_registered=mapper.registered[mapper.image_unit] & ~mapper.missing & ~left_out,
+        image_registered=mapper.image_posed & ~left_out,
         world_from_rig=poses,
         sigma_position_m=sigma,
         calibration=_calibrations(mapper, refinement),

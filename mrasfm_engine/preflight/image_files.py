@@ -93,9 +93,9 @@ def _repeated(drive: Drive, images: Sequence[DriveImage]) -> Iterator[Finding]:
     runs = runs_of_same_images(drive.root, images)
     for camera, given in enumerate(drive.cameras):
         copies = [run[1:] for run in runs if run[0].camera == camera]
-        count = sum(image.camera == camera for image in drive.images)
         if not copies:
             continue
+        count = sum(image.camera == camera for image in drive.images)
         files = [image.file for run in copies for image in run]
         yield warning(
             "repeated-images",

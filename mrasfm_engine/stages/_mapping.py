@@ -77,14 +77,20 @@ def mapping_of(run: Run, keypoints: Keypoints, pairs: Sequence[PairMatches], kno
 
 def packed(parts: Sequence[Component], found: Sequence[ImageFeatures]) -> tuple[Arrays, dict[str, Any]]:
     """Components as arrays, and the report of the stage."""
-    for part in parts:
-        part.mapper.missing |= np.array([features.left_out is not None for features in found])
+    leave_out_images(parts, found)
     arrays = {
         f"{number}.{name}": array
         for number, part in enumerate(parts)
         for name, array in part.mapper.to_arrays().items()
     }
     return arrays, described(parts)
+
+
+def leave_out_images(parts: Sequence[Component], found: Sequence[ImageFeatures]) -> None:
+    """Take their poses from the images that were left out."""
+    left_out = np.array([features.left_out is not None for features in found])
+    for part in parts:
+        part.mapper.missing |= left_out
 
 
 def described(parts: Sequence[Component]) -> dict[str, Any]:

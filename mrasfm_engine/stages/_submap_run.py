@@ -18,7 +18,14 @@ from mrasfm_engine.scene.submaps import Span
 from mrasfm_engine.stages._begin import prior
 from mrasfm_engine.stages._cut import SUBMAPS
 from mrasfm_engine.stages._features import extract
-from mrasfm_engine.stages._mapping import described, keypoints_of, mapping_of, mapping_settings, numbered
+from mrasfm_engine.stages._mapping import (
+    described,
+    keypoints_of,
+    leave_out_images,
+    mapping_of,
+    mapping_settings,
+    numbered,
+)
 from mrasfm_engine.stages._matches import match, match_settings, read_pairs
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.stages._standing import in_units
@@ -89,8 +96,7 @@ class SubmapRun:
             except ReconstructionError as problem:
                 return arrays, {"components": [], "reason": str(problem)}
             parts = begun.put_together()
-            for part in parts:
-                part.mapper.missing |= np.array([image.left_out is not None for image in features])
+            leave_out_images(parts, features)
             for number, part in enumerate(parts):
                 arrays |= {f"{number}.{name}": array for name, array in part_arrays(part).items()}
             # What they find, the joined scene finds as well.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 
 import cv2
@@ -57,8 +57,10 @@ def write(folder: Path, units: int, draw: Draw, cameras: int = 1) -> Drive:
     return drive
 
 
-def standing_of(drive: Drive, prior: PriorTrajectory = NO_PRIOR, threads: int = 2) -> Standing:
-    return find_standing(drive, prior, min_motion_px=MIN_MOTION_PX, threads=threads)
+def standing_of(
+    drive: Drive, prior: PriorTrajectory = NO_PRIOR, threads: int = 2, repeated: Collection[str] = ()
+) -> Standing:
+    return find_standing(drive, prior, min_motion_px=MIN_MOTION_PX, repeated=repeated, threads=threads)
 
 
 def stop_px(unit: int) -> float:
@@ -99,7 +101,7 @@ def test_images_that_are_those_before_once_more_do_not_stand(tmp_path: Path, cam
     shown = [unit if unit < 3 or unit > 7 else 2 for unit in range(11)]
     drive = write(tmp_path, 11, lambda unit, k: view(k, 25.0 * (shown[unit] if k < hung else unit)), cameras)
     repeated = files_of(drive, range(3, 8), hung)
-    assert find_standing(drive, NO_PRIOR, min_motion_px=MIN_MOTION_PX, repeated=repeated, threads=2).included.all()
+    assert standing_of(drive, repeated=repeated).included.all()
     assert (not standing_of(drive).included.all()) == (2 * hung >= cameras), "which nobody else would tell"
 
 
@@ -107,7 +109,7 @@ def test_images_that_are_those_before_once_more_do_not_stand(tmp_path: Path, cam
 def test_units_without_images_of_their_own_stand_where_the_next_one_does(tmp_path: Path, units: Iterable[int]) -> None:
     drive = write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit)))
     repeated = files_of(drive, units, 1)
-    found = find_standing(drive, NO_PRIOR, min_motion_px=MIN_MOTION_PX, repeated=repeated, threads=2)
+    found = standing_of(drive, repeated=repeated)
     shown = [unit for unit in range(2, 8) if unit not in units]
     assert found.spans() == [(shown[0], shown[-1])]
     assert not np.isnan(found.moved_px[~found.included]).any()
