@@ -75,8 +75,8 @@ def assess_directions(
     sigma_rotation_rad, sigma_translation_m
         Prior standard deviations (c,) of each axis.
     weight
-        Weights (c,) that the prior has left in the adjustment, of which cameras far from where or how they were given
-        keep little: positions may well know the length of their baselines better than that.
+        Weights (c,) that the prior of places has left in the adjustment, of which cameras far from where they were
+        given keep little: positions may well know the length of their baselines better than that.
     """
     cameras = len(position_m)
     if not np.isfinite(covariance).all():

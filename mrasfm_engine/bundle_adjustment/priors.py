@@ -40,10 +40,11 @@ class CalibrationPrior:
     """Keeps `rig_from_cam` near what was given, and holds the gauge between cameras and units.
 
     Residuals of a camera: rotation vector of R R_given' over sigma, and t - t_given over sigma, in rig axes, with a
-    Cauchy loss over those that are not held: what is held comes back from wherever it has got. Moving all cameras by
-    one transform and all units by its inverse changes no image: the weighted mean correction of all cameras is held at
-    zero. The weights stay fixed during a solve, so that the gauge is linear; they are renewed from the corrections
-    between solves, see `robust_gauge_weights`.
+    Cauchy loss each over those that are not held: what is held comes back from wherever it has got, and a camera that
+    was knocked is turned but still where it was mounted. Moving all cameras by one transform and all units by its
+    inverse changes no image: the weighted mean correction of all cameras is held at zero. The weights stay fixed during
+    a solve, so that the gauge is linear; they are renewed from the corrections between solves, see
+    `robust_gauge_weights`.
     """
 
     rotation: Floats  # (c, 3, 3) given
@@ -51,7 +52,7 @@ class CalibrationPrior:
     sigma_rotation_rad: Floats  # (c,)
     sigma_translation_m: Floats  # (c,)
     gauge_weights: Floats | None = None  # (c,) equal if None
-    loss_scale: float = 3.0  # in sigmas, of one camera's correction as a whole
+    loss_scale: float = 3.0  # in sigmas, of one camera's rotation or translation as a whole
     held: Bools | None = None  # (c, 6) directions that stay as given, as the drive does not observe them
 
     def corrections(self, state: State) -> Floats:
@@ -62,10 +63,9 @@ class CalibrationPrior:
         """This prior with the gauge's weights renewed from the corrections of a state."""
         return replace(self, gauge_weights=robust_gauge_weights(self._whitened(state)[0]))
 
-    def own_weights(self, state: State) -> Floats:
-        """Weights (c,) of the loss on each camera's correction: 1 for one as given, near 0 for one far from there."""
-        squared = (self._whitened(state)[0] ** 2).sum(axis=1)
-        result: Floats = 1.0 / (1.0 + squared / self.loss_scale**2)
+    def weights_of_places(self, state: State) -> Floats:
+        """Weights (c,) of the loss on each camera's place: 1 for one as given, near 0 for one far from there."""
+        result: Floats = _loss_weights(self._whitened(state)[0], self.loss_scale)[:, 3]
         return result
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
@@ -111,12 +111,23 @@ def _corrections(rotation: Floats, position_m: Floats, from_rotation: Floats, fr
 def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> float:
     """Cost of a rig's corrections over their sigmas (n, 6), and of their weighted mean over gauge (n, 6).
 
-    Of a camera's own there is a Cauchy loss over those that are not held, and squares of the rest.
+    Of a camera's own there is a Cauchy loss each over rotation and translation, of those that are not held, and squares
+    of the rest.
     """
     s2 = loss_scale**2
-    loose, firm = ((np.where(mask, r, 0.0) ** 2).sum(1) for mask in (~held, held))
-    own = 0.5 * (s2 * np.log1p(loose / s2) + firm / HELD_SHARE**2).sum()
-    return float(own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
+    own = s2 * np.log1p(_squared(np.where(held, 0.0, r)) / s2).sum() + (r[held] ** 2).sum() / HELD_SHARE**2
+    return float(0.5 * own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
+
+
+def _squared(r: Floats) -> Floats:
+    """Squared lengths (n, 2) of rotations and of translations of r (n, 6)."""
+    result: Floats = (r.reshape(-1, 2, 3) ** 2).sum(axis=2)
+    return result
+
+
+def _loss_weights(loose: Floats, loss_scale: float) -> Floats:
+    """Weights (n, 6) that the loss gives rotations and translations of corrections over their sigmas (n, 6)."""
+    return np.repeat(1.0 / (1.0 + _squared(loose) / loss_scale**2), 3, axis=1)
 
 
 def _add_rig(
@@ -129,8 +140,7 @@ def _add_rig(
     rows = (layout.camera_dof * layout.camera_slot[cameras[free]])[:, None] + np.arange(6)
     j = (step / sigma[:, :, None])[free]
 
-    loose = (np.where(held, 0.0, r) ** 2).sum(1, keepdims=True)
-    weights = np.where(held, HELD_SHARE**-2, 1.0 / (1.0 + loose / loss**2))[free]
+    weights = np.where(held, HELD_SHARE**-2, _loss_weights(np.where(held, 0.0, r), loss))[free]
     j_w = np.swapaxes(weights[:, :, None] * j, 1, 2)
     extra.cameras[rows[:, :, None], rows[:, None, :]] += j_w @ j
     extra.camera_gradient[rows] += (j_w @ r[free, :, None])[:, :, 0]
@@ -163,7 +173,7 @@ class CameraPosePrior:
     """Keeps the cameras of one rig near where an earlier adjustment found them, direction by direction.
 
     Residuals of a camera: rotation vector of R R_found' and t - t_found over their sigmas, in rig axes, with a Cauchy
-    loss over those that are not held. The gauge between cameras and units: the cameras' mean correction is held at
+    loss each over those that are not held. The gauge between cameras and units: the cameras' mean correction is held at
     zero. It is a plain mean, in which no camera stands for the rig because more is known of it.
     """
 

@@ -121,7 +121,7 @@ def scale_of_baselines(mapper: Mapper) -> tuple[float, float]:
     if min(np.linalg.norm(current), np.linalg.norm(given)) ** 2 < MIN_BASELINES_M2:
         return 1.0, np.inf  # cameras in one place have no scale
     information = ((given**2).sum(1) / prior.sigma_translation_m**2).sum()
-    weights = prior.own_weights(mapper.state)
+    weights = prior.weights_of_places(mapper.state)
     # Lengths alone: the images may have turned the baselines, and no turn shrinks or mirrors a scene.
     lengths_m = [
         float(np.sqrt(weights @ ((position_m - np.average(position_m, axis=0, weights=weights)) ** 2).sum(axis=1)))
@@ -221,7 +221,7 @@ def observed_directions(
         position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
-        weight=prior.own_weights(mapper.state),
+        weight=prior.weights_of_places(mapper.state),
     )
 
 

@@ -136,7 +136,7 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
             f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
             f"best two units share {0 if best is None else best[0]} points",
             remedy="Check that the images show a textured scene while the car moves, that cameras and files are not "
-            "mixed up, and that intrinsics fit the images.",
+            "mixed up, that intrinsics fit the images, and that rig_from_cam of every camera is right.",
             code="nothing-matches",
         )
     _, result, pose_u, pose_v = best

@@ -13,6 +13,7 @@ ITERATIONS = 40
 INITIAL_DAMPING = 1e-3
 CONVERGED = 0.1  # of what errors and prior leave uncertain
 SETTLED = 0.99  # of the spread that errors had before
+WEAK_PRIOR = 1e-3  # of the prior's weight: corrections of 30 sigmas cost what one does
 MEDIAN_SIGMAS = 0.6745  # median of the absolute values of a normal distribution
 
 
@@ -20,13 +21,12 @@ MEDIAN_SIGMAS = 0.6745  # median of the absolute values of a normal distribution
 class Errors:
     """Errors (n,) that have one spread, and their derivatives (n, k) in the unknowns `rows` (k,).
 
-    `variance` is what each has beside the spread, `weight` the share of an independent error that each counts as.
+    `weight` is the share of an independent error that each counts as.
     """
 
     rows: Ints
     error: Floats
     jacobian: Floats
-    variance: Floats
     weight: float
 
 
@@ -41,9 +41,11 @@ class Correction:
 def most_likely_correction(
     errors: Callable[[Floats], Sequence[Errors]], size: int, *, least_spread: Floats
 ) -> Correction:
-    """Minimise the errors under a Cauchy loss and a prior of unit variance, from zero on, by damped Gauss-Newton steps.
+    """Minimise the errors under a Cauchy loss and a prior of unit variance by damped Gauss-Newton steps.
 
-    The spread of a group of errors is what their median says, and never rises.
+    The spread of a group of errors is what their median says, and never rises. Where all of them are large, their
+    spread is, and they say next to nothing against the prior: it is also begun from where they lead with next to no
+    prior, and the likelier of both is the result.
 
     Parameters
     ----------
@@ -52,15 +54,28 @@ def most_likely_correction(
     least_spread
         Standard deviations (groups,) that errors have at least.
     """
-    x, damping = np.zeros(size), INITIAL_DAMPING
+    zero = np.zeros(size)
+    near, spread = _descended(errors, zero, least_spread=least_spread)
+    afar, _ = _descended(errors, zero, least_spread=least_spread, prior=WEAK_PRIOR)
+    other, narrower = _descended(errors, afar, least_spread=least_spread)
+    least = np.minimum(spread, narrower)
+    x = min(near, other, key=lambda x: _cost(errors(x), x, least))
+    return Correction(x=x, information=_normal_equations(errors(x), x, least)[0])
+
+
+def _descended(
+    errors: Callable[[Floats], Sequence[Errors]], start: Floats, *, least_spread: Floats, prior: float = 1.0
+) -> tuple[Floats, Floats]:
+    """The nearest minimum (size,) under the prior with a weight, and the errors' spread (groups,) there."""
+    x, damping = start, INITIAL_DAMPING
     here = errors(x)
     spread = _spread(here, least_spread)
     for _ in range(ITERATIONS):
         information, gradient = _normal_equations(here, x, spread)
-        damped = information + np.diag(1.0 + damping * np.diag(information))
-        step = -np.linalg.solve(damped, gradient + x)
+        damped = information + np.diag(prior + damping * np.diag(information))
+        step = -np.linalg.solve(damped, gradient + prior * x)
         there = errors(x + step)
-        if _cost(there, x + step, spread) > _cost(here, x, spread):
+        if _cost(there, x + step, spread, prior) > _cost(here, x, spread, prior):
             damping *= 10.0
             continue
         x, here, damping = x + step, there, 0.1 * damping
@@ -69,7 +84,7 @@ def most_likely_correction(
         spread = narrower
         if settled and step @ damped @ step < CONVERGED**2:
             break
-    return Correction(x=x, information=_normal_equations(here, x, spread)[0])
+    return x, spread
 
 
 def _spread(groups: Sequence[Errors], at_least: Floats) -> Floats:
@@ -81,16 +96,16 @@ def _normal_equations(groups: Sequence[Errors], x: Floats, spread: Floats) -> tu
     """J' W J and J' W r of the errors."""
     information, gradient = np.zeros((len(x), len(x))), np.zeros(len(x))
     for group, sigma in zip(groups, spread, strict=True):
-        weight = group.weight / (sigma**2 + group.variance + group.error**2)
+        weight = group.weight / (sigma**2 + group.error**2)
         weighted = weight[:, None] * group.jacobian
         information[np.ix_(group.rows, group.rows)] += group.jacobian.T @ weighted
         gradient[group.rows] += group.error @ weighted
     return information, gradient
 
 
-def _cost(groups: Sequence[Errors], x: Floats, spread: Floats) -> float:
-    """Half of the Cauchy loss of the errors and of the prior's."""
-    cost = 0.5 * float(x @ x)
+def _cost(groups: Sequence[Errors], x: Floats, spread: Floats, prior: float = 1.0) -> float:
+    """Half of the Cauchy loss of the errors, and of the prior's squares with its weight."""
+    cost = 0.5 * prior * float(x @ x)
     for group, sigma in zip(groups, spread, strict=True):
-        cost += 0.5 * group.weight * float(np.log1p(group.error**2 / (sigma**2 + group.variance)).sum())
+        cost += 0.5 * group.weight * float(np.log1p(group.error**2 / sigma**2).sum())
     return cost

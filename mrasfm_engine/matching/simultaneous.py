@@ -4,14 +4,14 @@ Matches between images of one instant obey one epipolar geometry in all units of
 of the cameras' relative poses than the images of one unit, and they say it before any unit has a pose: a camera that is
 a degree off its given rotation is found before its matches are thrown away for that.
 
-Corrections x of the cameras' rotations minimise
+Corrections x of the cameras' rotations and places minimise
 
     sum of rho(e^2 / variance) + x' P^-1 x
 
-with the Sampson distances e of `sampson` and the prior P. The variance is the keypoints' and what the prior of
-the cameras' places adds: matches say little of these. Of the result only what the images demand is used: along the
-principal directions of their information against the prior, those corrections that are significant. A rig that is given
-well enough stays exactly as given.
+with the Sampson distances e of `sampson`, the prior P and the variance of the keypoints. Of the result only what the
+images demand of the rotations is used, whatever the places are: along the principal directions of their information
+against the prior, those corrections that are significant. A rig that is given well enough stays exactly as given, and
+places always do: matches say little of them.
 """
 
 from __future__ import annotations
@@ -231,20 +231,22 @@ def estimate_rig(
     max_error_px
         Distance from its epipolar line at which a match counts as right.
     """
-    problem = _RotationProblem(
+    problem = _RigProblem(
         rig_from_cam=rig_from_cam,
         found=[one for one in found if len(one.rays_a)],
         sigma_rad=np.repeat(sigma_rotation_rad, 3),
-        variance_translation_m2=sigma_translation_m**2,
+        sigma_m=np.repeat(sigma_translation_m, 3),
         focal_px=focal_px,
     )
     at_least = MIN_SIGMA_PX * np.array([problem.pixel_rad(one) for one in problem.found])
-    correction = most_likely_correction(problem.errors, 3 * len(rig_from_cam), least_spread=at_least)
-    known, directions = np.linalg.eigh(correction.information)
-    posterior = 1.0 / np.sqrt(1.0 + np.maximum(known, 0.0))
-    along = directions.T @ correction.x
+    correction = most_likely_correction(problem.errors, 6 * len(rig_from_cam), least_spread=at_least)
+    turns = slice(0, 3 * len(rig_from_cam))
+    covariance = np.linalg.inv(np.eye(len(correction.x)) + correction.information)[turns, turns]
+    variance, directions = np.linalg.eigh(covariance)
+    posterior = np.sqrt(np.maximum(variance, 0.0))
+    along = directions.T @ correction.x[turns]
     demanded = np.abs(along) > SIGNIFICANT_SIGMAS * posterior
-    refined = problem.corrected(directions[:, demanded] @ along[demanded])
+    refined = problem.turned(directions[:, demanded] @ along[demanded])
     spread = (directions * posterior) * problem.sigma_rad[:, None]
     return RigEstimate(
         rig_from_cam=refined,
@@ -265,34 +267,38 @@ def _of_poses(covariance_rad2: Floats, variance_translation_m2: Floats) -> Float
 
 
 @dataclass(frozen=True, kw_only=True)
-class _RotationProblem:
-    """Corrections x (3 c,) of the cameras' rotations, in the prior's standard deviations, from matches of pairs."""
+class _RigProblem:
+    """Corrections of the cameras' rotations x (3 c,) and of their places after them, in the prior's standard
+    deviations, from matches of pairs.
+    """
 
     rig_from_cam: Floats  # (c, 4, 4) given
     found: Sequence[SimultaneousMatches]
     sigma_rad: Floats  # (3 c,) prior
-    variance_translation_m2: Floats  # (c,) prior
+    sigma_m: Floats  # (3 c,) prior
     focal_px: Floats  # (c,)
 
-    def corrected(self, x: Floats) -> Floats:
-        """Poses (c, 4, 4) with the rotations corrected."""
+    def turned(self, x: Floats) -> Floats:
+        """Poses (c, 4, 4) with the rotations corrected by x (3 c,)."""
         turned = se3.exp_so3((x * self.sigma_rad).reshape(-1, 3)) @ self.rig_from_cam[:, :3, :3]
         return se3.transform(turned, self.rig_from_cam[:, :3, 3])
 
     def errors(self, x: Floats) -> list[Errors]:
         """Errors of each pair of cameras, with no more information than of `INDEPENDENT_MATCHES`."""
-        rig, result = self.corrected(x), []
+        turns, shifts = np.split(x, 2)
+        rig, result = self.turned(turns), []
+        rig[:, :3, 3] += (shifts * self.sigma_m).reshape(-1, 3)
         for one in self.found:
             a, b = one.camera_a, one.camera_b
             error, derivatives, _ = epipolar_derivatives(rig[a], rig[b], one.rays_a, one.rays_b)
             rows = np.concatenate([3 * a + np.arange(3), 3 * b + np.arange(3)])
-            shift_m2 = self.variance_translation_m2[[a, b]].sum()
+            by_turns, by_place = derivatives[:, :6] * self.sigma_rad[rows], np.tile(derivatives[:, 6:], 2)
+            by_place *= self.sigma_m[rows] * np.repeat([1.0, -1.0], 3)
             result.append(
                 Errors(
-                    rows=rows,
+                    rows=np.concatenate([rows, len(turns) + rows]),
                     error=error,
-                    jacobian=derivatives[:, :6] * self.sigma_rad[rows],
-                    variance=shift_m2 * (derivatives[:, 6:] ** 2).sum(1),
+                    jacobian=np.concatenate([by_turns, by_place], axis=1),
                     weight=min(1.0, INDEPENDENT_MATCHES / len(error)),
                 )
             )

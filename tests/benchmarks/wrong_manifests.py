@@ -23,7 +23,6 @@ from tests.benchmarks.recalibration import AS_DECLARED
 from tests.benchmarks.table import Figure, exactly
 
 TURNED = 1  # of the rig's two cameras
-PITCH_DEG = 1.0
 FOCAL, SIGMA_FOCAL = 1.01, 0.02
 TURNING = ("--cameras", 6, "--units", 40, "--seed", 1, "--width", 640, "--height", 360)
 RTK = Receiver(white_m=0.02, declared_m=0.02)
@@ -36,13 +35,19 @@ def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
     """Line 18."""
     drive = imported(data, "kitti06", work)
     rtk = _rtk(drive)
-    for pitch_deg in (PITCH_DEG, -PITCH_DEG):
-        pitched = _pitched(pitch_deg)
-        title = f"kitti06, a camera pitched by {pitch_deg:+.0f} deg"
+    for what, turn_deg, without_gnss_m in (
+        ("pitched by +1 deg", (1.0, 0.0, 0.0), 0.20),
+        ("pitched by -1 deg", (-1.0, 0.0, 0.0), 0.20),
+        ("pitched by 12 deg", (12.0, 0.0, 0.0), 0.40),
+        ("yawed by 10 deg", (0.0, 10.0, 0.0), 0.40),
+        ("rolled by 12 deg", (0.0, 0.0, 12.0), 0.40),
+    ):
+        turned = _turned(turn_deg)
+        title = f"kitti06, a camera {what}"
         for receiver, edits, options, most_m in (
-            ("without GNSS", [pitched], ("--no-gnss",), 0.20),
-            ("GNSS", [pitched], (), 0.04),
-            ("RTK of 2 cm", [pitched, rtk], (), 0.04),
+            ("without GNSS", [turned], ("--no-gnss",), without_gnss_m),
+            ("GNSS", [turned], (), 0.04),
+            ("RTK of 2 cm", [turned, rtk], (), 0.04),
         ):
             scene = _reconstructed(drive, work / f"{title}, {receiver}", edits, *options)
             errors = evaluate(scene, drive)
@@ -104,11 +109,13 @@ def _reconstructed(drive: Path, out: Path, edits: Sequence[Edit], *options: obje
     return out
 
 
-def _pitched(by_deg: float) -> Edit:
+def _turned(by_deg: tuple[float, float, float]) -> Edit:
+    """A camera is given turned by a rotation vector in its own axes: pitch, yaw, roll."""
+
     def edit(manifest: dict[str, Any]) -> None:
         camera = manifest["rig"]["cameras"][TURNED]
         pose = matrix_from_pose(Pose(**camera["rig_from_cam"]))
-        pose[:3, :3] = pose[:3, :3] @ se3.exp_so3([np.radians(by_deg), 0.0, 0.0])
+        pose[:3, :3] = pose[:3, :3] @ se3.exp_so3(np.radians(by_deg))
         camera["rig_from_cam"] = pose_from_matrix(pose).model_dump()
 
     return edit

@@ -254,7 +254,12 @@ def _rig(
         offset += gauge_weight[k] * _difference(handed.problem.state.rig_from_cam[cameras[k]], given[k])
     for k in free.tolist():
         blocks.append(handed.camera_pose(int(cameras[k])))
-        for directions, share, loss in ((~held[k], 1.0, loss_scale), (held[k], priors.HELD_SHARE, None)):
+        turns = np.arange(6) < 3
+        for directions, share, loss in (
+            (~held[k] & turns, 1.0, loss_scale),
+            (~held[k] & ~turns, 1.0, loss_scale),
+            (held[k], priors.HELD_SHARE, None),
+        ):
             weight = np.where(directions, 1.0 / (share * sigma[k]), 0.0)[None]
             function = partial(_weighted_sum, given=given[[k]], weight=weight, correction=correction)
             yield Residuals(function=function, count=6, blocks=[blocks[-1]], loss_scale=loss)

@@ -314,6 +314,24 @@ def test_calibration_weights_single_out_the_bad_camera() -> None:
     assert (np.delete(weights, 2) > 0.9).all()
 
 
+def test_a_camera_that_is_turned_keeps_its_place() -> None:
+    truth = free_case()[0].truth
+    term = calibration_prior(truth)
+    turned, moved_m = truth.camera_rotation.copy(), truth.camera_position_m.copy()
+    turned[1] = se3.exp_so3(np.array([0.0, 30.0 * term.sigma_rotation_rad[1], 0.0])) @ turned[1]
+    moved_m[2, 0] += 30.0 * term.sigma_translation_m[2]
+    state = replace(truth, camera_rotation=turned, camera_position_m=moved_m)
+    np.testing.assert_allclose(term.weights_of_places(state)[[1, 2]], [1.0, 0.01], atol=1e-3)
+    # A step of the turned camera costs what it costs one that is as given.
+    step_m = np.zeros_like(moved_m)
+    step_m[[0, 1], 0] = np.array([-1.0, 1.0]) * term.sigma_translation_m[:2]  # the mean is held
+    dearer = [
+        term.cost(replace(one, camera_position_m=one.camera_position_m + step_m)) - term.cost(one)
+        for one in (truth, state)
+    ]
+    assert dearer[1] == pytest.approx(dearer[0], rel=0.01)
+
+
 def test_corrections_are_in_rig_axes() -> None:
     case, _ = free_case()
     step = se3.exp_so3(np.radians([0.1, 0.2, -0.3]))

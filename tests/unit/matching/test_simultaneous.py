@@ -85,6 +85,19 @@ def test_a_camera_that_is_turned_within_its_prior_is_found(sign: int, wrong: int
     assert rig.fitted > rig.fitted_as_given + 0.1
 
 
+@pytest.mark.parametrize("axis", [0, 2])  # a rig all around sees little of yaw
+def test_a_camera_that_is_turned_far_beyond_its_prior_is_found(axis: int) -> None:
+    """Matches that are all wrong by hundreds of pixels say next to nothing, until the camera is where it is."""
+    simulated = turned(1, (15.0 * np.eye(3)[axis]).tolist())
+    rig = estimate(simulated)
+    true = simulated.truth.rig_from_cam
+    neighbours = [b for b in range(6) if b != 1 and true[b, :3, 2] @ true[1, :3, 2] > 0.3]
+    for b in neighbours:
+        assert relative_error_deg(rig.rig_from_cam, true, 1, b) < 1.0
+    assert rig.fitted > 0.9
+    assert contradiction([c.name for c in simulated.drive.cameras], simulated.drive.rig_from_cam, rig) is not None
+
+
 def test_what_was_found_is_said_where_most_matches_contradict_the_calibration() -> None:
     given = make_simulated_drive(units=6, cameras=2, points=2000).drive.rig_from_cam
     estimated = given.copy()
