@@ -52,8 +52,8 @@ DARK = 8.0  # grey levels, about the noise of dark pixels: detail is relative to
 MIN_FALL = 0.17
 # Evidence along the outline. Where a camera looks along the motion, half of the length of a curved outline is across
 # it, and its contrast varies: a tenth remains with few images. What follows kerbs and noise has none on average.
-MIN_EVIDENCE_SHARE = 1 / 16
-MIN_EVIDENCE_PX = WIDTH_PX / 16  # less than this of an outline can be dirt or one thing that moves along
+MIN_EVIDENCE_SHARE = 1 / 20
+MIN_EVIDENCE_PX = WIDTH_PX / 20  # less than this of an outline can be dirt or one thing that moves along
 
 JPEG_BLOCK_PX = 16  # side of a block with subsampled colours
 SURROUND_LEVELS = 24  # grey levels that stray light and compression leave of black
@@ -303,10 +303,11 @@ def _static_region(drive: Drive, camera: int, statistics: _Statistics) -> Bools:
     # The dark around an image circle is no part of a sky that it touches, and its rim, which stays, none of the car.
     surround = _constant_border(statistics.constant & statistics.dark, edges.edge, block_px)
     other = _constant_border(statistics.constant & ~statistics.dark, edges.edge, block_px)
-    found = trace_outline(edges.without(_near(surround, block_px + RIM_PX)).turned(side))
-    is_car = found.evidence_px >= MIN_EVIDENCE_PX and found.evidence_share >= MIN_EVIDENCE_SHARE
-    mask = np.rot90(found.mask, -side) if is_car else np.zeros(fall.shape, np.bool_)
-    return np.ascontiguousarray(mask | surround | other)
+    result = surround | other
+    for part in trace_outline(edges.without(_near(surround, block_px + RIM_PX)).turned(side)):
+        if part.evidence_px >= MIN_EVIDENCE_PX and part.evidence_share >= MIN_EVIDENCE_SHARE:
+            result = result | np.rot90(part.mask, -side)
+    return np.ascontiguousarray(result)
 
 
 def _world_motion(drive: Drive, camera: int, shape: tuple[int, ...]) -> tuple[Floats, Floats, int]:

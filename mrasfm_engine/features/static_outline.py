@@ -26,9 +26,11 @@ RESOLUTION = 0.5  # of gradients, in grey levels: what 8 bits resolve
 LEAST_PART = 0.5  # of the mean contrast, that an edge has in every part of the way
 WINDOW_PX = 0.7  # sigma of the neighbourhood whose gradients count together
 # Paint mirrors the world smaller and fainter than it is, so that its detail changes less than that of what is behind.
-# Half of the change or less is another surface for sure.
+# Half of the change or less is another surface for sure, and half of the gradient's share is enough for an edge there:
+# world that is rich in contrast hides the edge of dark paint in front of it.
 CHANGE_WINDOW_PX = 1.5  # sigma
 CHANGE_RATIO = 2.0
+SURE_RISE = (CHANGE_RATIO - 1) / (CHANGE_RATIO + 1)  # difference of the changes above and below over their sum
 NO_CHANGE = 1e-3  # relative to the brightness; less is a constant pixel
 MIN_CHANGE_STEP = 0.3  # of that ratio, on a logarithmic scale; less is how much the change of one surface varies
 STEP_SIGMAS = 3.0  # of a step that few images alone make, in which one pixel in ninety has more
@@ -48,14 +50,16 @@ OUTER_FALL = 0.17  # beyond the least fall, from which on the evidence counts in
 SAME_EDGE_PX = 3
 SNAP_PX = 3  # an edge is blurred by that much; its middle is the outline
 GAP_SHARE, SPIKE_SHARE = 1 / 20, 1 / 70  # of the width: narrower gaps and spikes of the area are none
+SUPPORTED = 0.5  # of an edge, and of a column's neighbours, as the outline that makes a hull
 
 
 @dataclass(frozen=True, kw_only=True)
 class StaticEdges:
     """Judgement of every pixel (h, w) by the gradients of one camera's images."""
 
+    lasting: Floats32  # share of the gradient that stays, over the least that an edge keeps
     edge: Floats32  # 0 to 1: an edge stays here
-    evidence: Floats32  # 0 to 1: as well, and it is near ground and across the motion
+    across: Floats32  # 0 to 1: the gradient is along the motion, an edge across it
     always: Floats32  # 0 to 1: the edge is there in every part of the way
     step: Floats32  # 0 to 1: what is outside changes more
     step_evidence: Floats32  # 0 to 1: as well, across the motion
@@ -80,30 +84,31 @@ class StaticEdges:
             See `StaticEdges.fall`; directions (h, w, 2) in which the world moves.
         """
         gradient = gradients.mean(0)
-        lasting = _windowed((gradient**2).sum((0, 3)))
-        share = lasting / (_windowed(energy) + RESOLUTION**2)
+        constant = _windowed((gradient**2).sum((0, 3)))
+        share = constant / (_windowed(energy) + RESOLUTION**2)
         share = (count * share - 1) / (count - 1)  # what remains of gradients without anything in common is taken off
         least = max(MIN_LASTING_SHARE, NOISE_SHARES / count)
-        edge = _without_rim(np.clip(share / least - 1, 0, 1))
+        lasting = _without_rim(np.asarray(share / least, dtype=np.float32))
         near = fall > 0
         change = np.asarray(np.sqrt((changes**2).mean(0)), dtype=np.float32)
         slope = _change_slope(change)
         least_step = _least_step(changes, near & (change > NO_CHANGE))
         step = _without_rim(np.clip(np.hypot(*slope) - least_step, 0, 1) * near)
         return cls(
-            edge=edge,
-            evidence=edge * near * _across(gradient, flow),
+            lasting=lasting,
+            edge=np.clip(lasting - 1, 0, 1),
+            across=_across(gradient, flow),
             always=_always(gradients),
             step=step,
             step_evidence=step * _across(slope[..., None], flow),
-            strength=np.sqrt(lasting),
+            strength=np.sqrt(constant),
             change=np.asarray(cv2.blur(change, (5, 5)), dtype=np.float32),
             fall=fall.astype(np.float32),
         )
 
     def without(self, area: Bools) -> StaticEdges:
         """The same without edges in an area (h, w)."""
-        names = ("edge", "evidence", "always", "step", "step_evidence")
+        names = ("lasting", "edge", "always", "step", "step_evidence")
         cleared = {name: np.where(area, np.float32(0), getattr(self, name)) for name in names}
         return replace(self, **cleared)
 
@@ -114,48 +119,59 @@ class StaticEdges:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outline:
-    """Area below the best outline, and how sure it is."""
+class Part:
+    """One connected area below the best outline, and how sure it is."""
 
     mask: Bools  # (h, w)
     evidence_px: float  # length of the outline that the world cannot have
     evidence_share: float  # of the outline's length
 
 
-def trace_outline(edges: StaticEdges) -> Outline:
-    """Find the outline of what stays at the lower border of an image."""
-    rows = edges.edge.shape[0]
+def trace_outline(edges: StaticEdges) -> list[Part]:
+    """Find the outlines of what stays at the lower border of an image."""
     near = edges.fall > 0
     # Only what changes more above than below is the upper edge of a surface that changes little.
     above, below = _shifted(edges.change, RIM_PX), _shifted(edges.change, -RIM_PX)
     rises = np.clip((above - below) / (above + below + 1e-6), 0, 1)
-    step, step_evidence = edges.step * (rises > 0), edges.step_evidence * (rises > 0)
-    edge, evidence = np.maximum(edges.edge, step), np.maximum(edges.evidence, step_evidence)
+    lasting = np.clip(edges.lasting * (1 + np.clip(rises / SURE_RISE, 0, 1)) - 1, 0, 1)
+    lasting_evidence = lasting * near * edges.across
+    edge = np.maximum(lasting, edges.step * (rises > 0))
+    evidence = np.maximum(lasting_evidence, edges.step_evidence * (rises > 0))
     ground = float(np.quantile(edges.change[near], GROUND_QUANTILE)) if near.any() else float(edges.change.max())
     area = AREA * np.clip(1 - 2 * edges.change / max(ground, 1e-6), -1, 1)
     missing = NO_EDGE * (1 - edge)
     worth = near * (ALONG_MOTION * edge + (1 - ALONG_MOTION) * evidence) * (1 + NO_EDGE * rises)
     heights = _best_heights(worth - missing, area, missing)
+    sure = np.clip(edges.fall / OUTER_FALL, 0, 1)
+    outer = OUTER_WORTH * sure * (evidence - OUTER_ALONG_MOTION * edge) - missing
+    heights = _outermost(heights, outer, area, OUTER_NO_SIDE * (1 - edge))
+    heights = _snapped(heights, edges.strength)
+    is_edge = _along(heights, edge) > SUPPORTED
+    along = np.where(heights > 0, _along(heights, lasting_evidence * edges.always), 0.0)
+    tidied = _tidied(_below(heights, len(edge)), is_edge)
+    count, labels = cv2.connectedComponents(tidied.astype(np.uint8), connectivity=4)
+    of_column = labels[-1]
+    return [
+        Part(
+            mask=labels == label,
+            evidence_px=float(along[of_column == label].sum()),
+            evidence_share=float(along[of_column == label].mean()) if (of_column == label).any() else 0.0,
+        )
+        for label in range(1, count)
+    ]
+
+
+def _outermost(heights: Ints, crossing: NDArray[Any], area: NDArray[Any], side: NDArray[Any]) -> Ints:
+    """Heights (w,) of the outermost outline that pays outside of the one with some heights, see `_best_heights`."""
     for _ in range(OUTER_PASSES):
-        inside = _below(heights, rows).astype(np.uint8)
-        side = 2 * SAME_EDGE_PX + 1
-        known = cv2.dilate(inside, np.ones((side, side), np.uint8)) > 0
-        sure = np.clip(edges.fall / OUTER_FALL, 0, 1)
-        outer = OUTER_WORTH * sure * (evidence - OUTER_ALONG_MOTION * edge) - missing
-        costs = (outer, area, OUTER_NO_SIDE * (1 - edge))
-        found = _best_heights(*(np.where(known, np.float32(0), cost) for cost in costs))
+        reach = 2 * SAME_EDGE_PX + 1
+        known = cv2.dilate(_below(heights, len(area)).astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+        found = _best_heights(*(np.where(known, np.float32(0), cost) for cost in (crossing, area, side)))
         farther = (found > heights + SAME_EDGE_PX) & heights.any()
         if not farther.any():
             break
         heights = np.where(farther, found, heights)
-    heights = _snapped(heights, edges.strength)
-    along, is_outline = _along(heights, edges.evidence * edges.always), heights > 0
-    length = int(is_outline.sum())
-    return Outline(
-        mask=_tidied(_below(heights, rows)),
-        evidence_px=float(along[is_outline].sum()),
-        evidence_share=float(along[is_outline].sum() / max(length, 1)),
-    )
+    return heights
 
 
 def _windowed(values: Floats32) -> Floats32:
@@ -226,26 +242,28 @@ def _snapped(heights: Ints, strength: Floats32) -> Ints:
     return result
 
 
-def _along(heights: Ints, values: Floats32) -> Floats32:
+def _along(heights: Ints, values: NDArray[Any]) -> NDArray[Any]:
     """Largest value (w,) within a pixel of an outline."""
     rows = len(values)
     at = np.clip(rows - heights[None] + np.array([-1, 0, 1])[:, None], 0, rows - 1)
     return np.asarray(values[at, np.arange(values.shape[1])[None]].max(0))
 
 
-def _tidied(mask: Bools) -> Bools:
+def _tidied(mask: Bools, is_edge: Bools) -> Bools:
     """The area without narrow gaps and spikes, and without dents: sheet metal is convex.
 
-    A dent is where the paint mirrors what looks like the ground beside it. Spikes (an aerial) make no hull.
+    A dent is where the paint mirrors what looks like the ground beside it. Spikes (an aerial) make no hull, nor do
+    columns most of whose neighbourhood has no edge at the outline (`is_edge`, (w,)).
     """
     width = mask.shape[1]
     gap, spike = (max(3, round(share * width) // 2 * 2 + 1) for share in (GAP_SHARE, SPIKE_SHARE))
     area = cv2.copyMakeBorder(mask.astype(np.uint8), gap, gap, gap, gap, cv2.BORDER_REPLICATE)
+    supported = cv2.blur(np.pad(is_edge, gap, mode="edge").astype(np.float32)[None], (gap, 1)) > SUPPORTED
     closed, body = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)) for side in (gap, spike))
     area = cv2.morphologyEx(cv2.morphologyEx(area, cv2.MORPH_CLOSE, closed), cv2.MORPH_OPEN, body)
     hulls, bodies = np.zeros_like(area), area.copy()
     bodies[-gap:] = 0  # low strips beside the car are no part of its body
-    bodies = cv2.morphologyEx(bodies, cv2.MORPH_OPEN, closed)
+    bodies = cv2.morphologyEx(bodies, cv2.MORPH_OPEN, closed) * supported.astype(np.uint8)
     count, labels = cv2.connectedComponents(area)
     for label in range(1, count):
         body = cv2.findNonZero(bodies * (labels == label))
