@@ -12,6 +12,7 @@ from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, StorageError
+from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import scratch_folder
 from mrasfm_engine.export.scene import require_free_folder, write_scene
 from mrasfm_engine.io.read_map import is_map
@@ -76,14 +77,18 @@ def reconstruct(
         prior, spans = _begun(run)
         # No name for what was mapped: it is most of what stands in memory, and only the refinement needs it.
         scene, components = stages.refinement(run, stages.mapped(run, spans, prior), prior)
+        whole, parts = stages.numbered_components(run, *stages.all_units(run, scene, components))
         with scratch_folder(out) as scratch:
-            pictures = stages.pictures(run, scene, scratch)
-            if cancel():
-                raise CancelledError
-            run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
-            run.begin(Stage.EXPORT)
-            whole, parts = stages.numbered_components(run, *stages.all_units(run, scene, components))
-            write_scene(whole, out, run.report, pictures, parts)
+
+            def draw() -> PictureFiles:
+                pictures = stages.pictures(run, scene, scratch)
+                if cancel():
+                    raise CancelledError
+                run.report["compilation"] = {"functions": compiled.functions, "seconds": round(compiled.seconds, 3)}
+                run.begin(Stage.EXPORT)
+                return pictures
+
+            write_scene(whole, out, run.report, draw, parts)
     run.progress(Stage.EXPORT, 1, 1)
     return run.report
 

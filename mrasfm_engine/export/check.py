@@ -49,8 +49,8 @@ def binary_model_checks(scene: Scene) -> list[Check]:
     ]
 
 
-def common_checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
-    """Checks of the other files that scenes and maps have alike."""
+def common_checks(scene: Scene) -> list[Check]:
+    """Checks of the other files that scenes and maps have alike, but for those of `completing_checks`."""
     text = [
         Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
         Check("model/text/points3D.txt", readers.points_text, partial(comparisons.points_text, scene)),
@@ -61,6 +61,12 @@ def common_checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
         Check("points.ply", readers.ply, partial(comparisons.ply, scene)),
         Check("frame.json", readers.json_object, partial(comparisons.frame, scene)),
         Check("poses.json", readers.json_object, partial(comparisons.poses, scene)),
+    ]
+
+
+def completing_checks(pictures: PictureFiles) -> list[Check]:
+    """Checks of the files that come last: the report and the pictures."""
+    return [
         Check(REPORT_FILE, readers.json_object, comparisons.nothing),
         *(_picture_check(f"{PICTURES_FOLDER}/{name}", data) for name, data in pictures.items()),
     ]

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.export import comparisons, coordinate_frame, interchange, picture_files, pose_files, readers
-from mrasfm_engine.export.check import Check, ReadBack, common_checks
+from mrasfm_engine.export.check import Check, ReadBack, common_checks, completing_checks
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.file_contents import sha256, write_content
 from mrasfm_engine.export.interchange import Interchange
@@ -89,7 +89,8 @@ def require_free_folder(out: Path) -> None:
 
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:
     scene, read_back = content.scene, ReadBack(work)
-    figures = write_common(scene, work, content.pictures, read_back)
+    picture_files.write_pictures(content.pictures, work / PICTURES_FOLDER)
+    figures = write_common(scene, work, read_back)
     rigs = {f"{RIGS_FOLDER}/{name}": f"{name}/" for name in content.calibrations}
     others = Interchange(scene=scene, scene_of_unit=content.scene_of_unit, rigs=rigs, map_document=content.document)
     figures["notes"] += others.write(work, read_back)
@@ -132,7 +133,8 @@ def _checks(content: MapContent) -> list[Check]:
         for name, (key, _, _) in parts.items()
     ]
     return [
-        *common_checks(scene, content.pictures),
+        *common_checks(scene),
+        *completing_checks(content.pictures),
         Check("poses.tum", readers.tum, partial(comparisons.tum, scene, _order(scene))),
         Check(MAP_FILE, readers.json_object, partial(_pictures_exist, content.pictures)),
         *calibrations,

@@ -204,10 +204,21 @@ def _prepare(needed: int, out: Path, home: Path) -> None:
         raise NotADirectoryError(errno.ENOTDIR, "it is a file, not a folder")
     home.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(home, f".{glob.escape(out.name)}.partial-*")
-    free = shutil.disk_usage(home).free
-    if free < needed:
+    require_space(needed, home, what=out)
+
+
+def require_space(needed_bytes: int, folder: Path, *, what: Path | None = None) -> None:
+    """Refuse to write what does not fit on the disk of a folder; the message names `what`, or the folder.
+
+    Raises
+    ------
+    StorageError
+        Where there is less space.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < needed_bytes:
         raise StorageError(
-            f"{out} needs about {needed / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
+            f"{what or folder} needs about {needed_bytes / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
             remedy="Free space on this disk, or choose another folder.",
         )
 

@@ -11,10 +11,11 @@ with a `report.json` is complete.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -33,11 +34,11 @@ from mrasfm_engine.export import (
     readers,
     road,
 )
-from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks
+from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks, completing_checks
 from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free
+from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free, require_space
 from mrasfm_engine.export.report_page import scene_page, write_page
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.io.plain_json import plain
@@ -52,7 +53,7 @@ from schemas.artifacts import (
     component_folder,
 )
 
-NO_PICTURES: PictureFiles = MappingProxyType({})
+Draw = Callable[[], PictureFiles]
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
 ALWAYS = (
@@ -68,11 +69,16 @@ ALWAYS = (
 REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 
+def no_pictures() -> PictureFiles:
+    """The files of `pictures/` where none are drawn."""
+    return {}
+
+
 def write_scene(
     scene: Scene,
     out: Path,
     report: Mapping[str, Any],
-    pictures: PictureFiles = NO_PICTURES,
+    draw: Draw = no_pictures,
     components: Sequence[tuple[Scene, Mapping[str, Any]]] = (),
 ) -> None:
     """Write all files of a scene into the folder `out`.
@@ -84,9 +90,11 @@ def write_scene(
     Parameters
     ----------
     report
-        What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths.
-    pictures
-        Files of `pictures/` by name, large ones on the disk of `out`; those of an earlier scene there are removed.
+        What `report.json` holds besides a `summary`; JSON values, numpy scalars and arrays, paths. `draw` may add to
+        it.
+    draw
+        Makes the files of `pictures/` by name, large ones on the disk of `out`, while a thread writes and reads files
+        that do not need them; those of an earlier scene there are removed.
     components
         Parts of the drive that nothing links to the scene, each in a frame of its own, with their reports: scenes in
         `components/1`, `components/2` and so on.
@@ -101,14 +109,13 @@ def write_scene(
     scenes = [scene, *(other for other, _ in components)]
     for one in scenes:
         check_scene(one)
-    report = {**report, "components": component_list(scenes)}
-    needed = sum(map(_size_bytes, scenes)) + picture_files.size_bytes(pictures)
-    with publishing(out, needed, replaced=REPLACED) as work:
-        _write(scene, work, report, pictures, [other.unit_registered for other, _ in components])
+    with publishing(out, sum(map(_size_bytes, scenes)), replaced=REPLACED) as work:
+        parts = _Parts(units=[other.unit_registered for other, _ in components], listed=component_list(scenes))
+        _write(scene, work, report, draw, parts)
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
-            _write(other, folder, own_report, NO_PICTURES)
+            _write(other, folder, own_report)
 
 
 def require_free_folder(out: Path) -> None:
@@ -157,15 +164,37 @@ def summary(scene: Scene) -> dict[str, Any]:
     return figures
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Parts:
+    """Parts of the drive that are scenes of their own: their units, and the report's list of all."""
+
+    units: Sequence[Bools] = ()
+    listed: Sequence[Mapping[str, Any]] | None = None
+
+
 def _write(
-    scene: Scene,
-    work: Path,
-    report: Mapping[str, Any],
-    pictures: PictureFiles,
-    components: Sequence[Bools] = (),
+    scene: Scene, work: Path, report: Mapping[str, Any], draw: Draw = no_pictures, parts: _Parts = _Parts()
 ) -> None:
     read_back = ReadBack(work)
-    figures = write_common(scene, work, pictures, read_back)
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(_write_beside_pictures, scene, work, parts, report.get("component", 0), read_back)
+        pictures = draw()
+        figures, calibrated = beside.result()
+    require_space(picture_files.size_bytes(pictures), work)
+    picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
+    document = {**report, **({} if parts.listed is None else {"components": parts.listed}), "summary": figures}
+    make_page = partial(scene_page, scene, work, document, calibrated)
+    figures["notes"] += write_page(work, make_page, read_back, {"": calibrated})
+    read_back.expect({COMPLETE_MARK: write_json(work / COMPLETE_MARK, document)})
+    read_back.check(completing_checks(pictures))
+    read_back.require_all()
+
+
+def _write_beside_pictures(
+    scene: Scene, work: Path, parts: _Parts, component: int, read_back: ReadBack
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Write and read all files that need no pictures; the report's `summary`, and `calibration.json`."""
+    figures = write_common(scene, work, read_back)
     names = [scene.drive.manifest.name] * len(scene.unit_registered)
     others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
     figures["notes"] += others.write(work, read_back)
@@ -175,25 +204,20 @@ def _write(
         digests[ROAD_FILE] = write_json(work / ROAD_FILE, road.road_document(scene))
     digests["poses.tum"] = write_content(work / "poses.tum", pose_files.poses_text(scene))
     digests["poses.json"] = write_json(
-        work / "poses.json", pose_files.poses_document(scene, components), in_lines=pose_files.LISTS
+        work / "poses.json", pose_files.poses_document(scene, parts.units), in_lines=pose_files.LISTS
     )
-    calibrated = calibration.calibration_document(scene, report.get("component", 0))
+    calibrated = calibration.calibration_document(scene, component)
     digests["calibration.json"] = write_json(work / "calibration.json", calibrated)
     digests["frame.json"] = write_json(work / "frame.json", coordinate_frame.frame_document(scene))
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     digests[MANIFEST_FILE] = write_content(work / MANIFEST_FILE, manifest + "\n")
-    document = {**report, "summary": figures}
-    make_page = partial(scene_page, scene, work, document, calibrated)
-    figures["notes"] += write_page(work, make_page, read_back, {"": calibrated})
-    digests[COMPLETE_MARK] = write_json(work / COMPLETE_MARK, document)
     read_back.expect(digests)
-    read_back.check(_checks(scene, pictures))
-    read_back.require_all()
+    read_back.check(_checks(scene))
+    return figures, calibrated
 
 
-def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: ReadBack) -> dict[str, Any]:
-    """Write what scenes and maps have alike: pictures, model and points; the figures of `report.json`'s `summary`."""
-    picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
+def write_common(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any]:
+    """Write what scenes and maps have alike: model and points; the figures of `report.json`'s `summary`."""
     model, figures = work / "model", summary(scene)
     model.mkdir()
     read_back.expect({f"model/{name}": digest for name, digest in colmap.write_model(scene, model).items()})
@@ -208,11 +232,11 @@ def write_common(scene: Scene, work: Path, pictures: PictureFiles, read_back: Re
     return figures
 
 
-def _checks(scene: Scene, pictures: PictureFiles) -> list[Check]:
+def _checks(scene: Scene) -> list[Check]:
     road_check = Check(ROAD_FILE, readers.json_object, partial(comparisons.road, scene))
     registered = np.flatnonzero(scene.unit_registered)
     return [
-        *common_checks(scene, pictures),
+        *common_checks(scene),
         *([] if scene.road is None else [road_check]),
         *(
             Check(f"{OWN_CAR_FOLDER}/{name}", Path.read_bytes, partial(comparisons.content, data))

@@ -69,11 +69,15 @@ def read_image_small(path: Path, size_px: tuple[int, int], width_px: int, *, col
         return None
     image = decode_jpeg_small(data, colours, width_px) if header.format == "JPEG" else None
     if image is None:
-        image = read_image_rgb(path) if colours == "RGB" else read_image_gray(path)
-    if header.width <= width_px:
-        return image
-    size = (width_px, max(1, round(header.height * width_px / header.width)))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        # Of three equal channels one is made smaller.
+        is_gray = colours == "GRAY" or (header.kind is ImageKind.GRAY and not _needs_conversion(header))
+        image = read_image_gray(path) if is_gray else read_image_rgb(path)
+    if header.width > width_px:
+        size = (width_px, max(1, round(header.height * width_px / header.width)))
+        image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    if colours == "RGB" and image.ndim == 2:
+        image = np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), dtype=np.uint8)
+    return image
 
 
 def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:

@@ -161,7 +161,7 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
     report = {"engine_version": "1.0", "stages": [{"stage": "mapping", "seconds": 2.5}], "findings": []}
     scene = make_scene()
     scene.calibration[1].__dict__["is_wrong"] = True
-    write_scene(scene, folder / "scene", report, {name: png_of(noise) for name in names})
+    write_scene(scene, folder / "scene", report, lambda: {name: png_of(noise) for name in names})
     files = {
         p.relative_to(folder / "scene").as_posix(): p.read_bytes() for p in (folder / "scene").rglob("*") if p.is_file()
     }

@@ -17,7 +17,7 @@ import pycolmap
 import pytest
 
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.errors import InputError, MrasfmError, StorageError
+from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, StorageError
 from mrasfm_engine.export import comparisons, feature_database, picture_files, ply, publishing, readers
 from mrasfm_engine.export.calibration import calibration_document, document_in_map
 from mrasfm_engine.export.colmap import approximations, colmap_models
@@ -495,13 +495,31 @@ def test_a_scene_that_contradicts_itself_is_refused(
 def test_pictures_are_part_of_the_scene(scene: Scene, tmp_path: Path) -> None:
     out = tmp_path / "scene"
     picture = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
-    write_scene(scene, out, {}, {"a.png": picture_files.png_of(picture)})
+    write_scene(scene, out, {}, lambda: {"a.png": picture_files.png_of(picture)})
     assert {p.name for p in out.iterdir()} == {*FILES, "pictures"}
     np.testing.assert_array_equal(read_image_rgb(out / "pictures" / "a.png"), picture)
-    write_scene(scene, out, {}, {"b.png": picture_files.png_of(picture[:20])})
+    write_scene(scene, out, {}, lambda: {"b.png": picture_files.png_of(picture[:20])})
     assert [p.name for p in (out / "pictures").iterdir()] == ["b.png"]
     write_scene(scene, out, {})
     assert {p.name for p in out.iterdir()} == FILES  # old pictures would show another scene
+
+
+def test_drawing_adds_to_the_report_and_ends_a_run_with_nothing_published(scene: Scene, tmp_path: Path) -> None:
+    report: dict[str, Any] = {"stages": ["mapping"]}
+
+    def draw() -> dict[str, bytes]:
+        report["stages"].append("pictures")
+        return {}
+
+    write_scene(scene, tmp_path / "scene", report, draw)
+    assert json.loads((tmp_path / "scene" / "report.json").read_text())["stages"] == ["mapping", "pictures"]
+
+    def stop() -> dict[str, bytes]:
+        raise CancelledError
+
+    with pytest.raises(CancelledError):
+        write_scene(scene, tmp_path / "other", report, stop)
+    assert_nothing_published(tmp_path / "other")
 
 
 def test_a_picture_that_does_not_read_back_is_withheld(
@@ -512,7 +530,9 @@ def test_a_picture_that_does_not_read_back_is_withheld(
         Path, "write_bytes", lambda path, data: write_bytes(path, data[: len(data) - (path.suffix == ".png")])
     )
     with pytest.raises(MrasfmError, match=r"a.png was written but does not read back"):
-        write_scene(scene, tmp_path / "scene", {}, {"a.png": picture_files.png_of(np.ones((2, 2, 3), np.uint8))})
+        write_scene(
+            scene, tmp_path / "scene", {}, lambda: {"a.png": picture_files.png_of(np.ones((2, 2, 3), np.uint8))}
+        )
     assert_nothing_published(tmp_path / "scene")
 
 

@@ -100,7 +100,7 @@ def flipping(file: str, bit: float) -> Callable[[ReadBack, Check], str | None]:
 
 
 def write_road(out: Path) -> None:
-    write_scene(scene_with_road(), out, {}, PICTURES)
+    write_scene(scene_with_road(), out, {}, lambda: PICTURES)
 
 
 def write_one_map(out: Path) -> None:
@@ -139,7 +139,7 @@ def unseen(
 @pytest.fixture(scope="module")
 def files_of_a_scene(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     out = tmp_path_factory.mktemp("scene") / "scene"
-    write_scene(scene_with_road(), out, {}, PICTURES)
+    write_scene(scene_with_road(), out, {}, lambda: PICTURES)
     return sorted(path.relative_to(out).as_posix() for path in out.rglob("*") if path.is_file())
 
 

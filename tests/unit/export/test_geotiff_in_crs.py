@@ -44,7 +44,7 @@ def road_tiff(folder: Path, tiles: list[tuple[int, int]]) -> bytes:
 @pytest.fixture
 def scene_folder(tmp_path: Path) -> Path:
     picture = road_tiff(tmp_path, [(0, 0), (0, 1), (1, 3), (2, 3)])
-    write_scene(make_scene(), tmp_path / "scene", {}, {"road.tif": picture})
+    write_scene(make_scene(), tmp_path / "scene", {}, lambda: {"road.tif": picture})
     return tmp_path / "scene"
 
 
@@ -99,10 +99,10 @@ def test_a_scene_without_a_picture_and_one_that_is_too_large(tmp_path: Path) -> 
     with pytest.raises(InputError, match=r"has no pictures/road.tif"):
         exported(tmp_path / "none" / "scene")
     picture = road_tiff(tmp_path, [(0, column) for column in (0, 1000, 2000, 3000)])  # 19 km
-    write_scene(make_scene(), tmp_path / "large" / "scene", {}, {"road.tif": picture})
+    write_scene(make_scene(), tmp_path / "large" / "scene", {}, lambda: {"road.tif": picture})
     with pytest.raises(InputError, match=r"too large for EPSG:25832: its cells would be off") as found:
         exported(tmp_path / "large" / "scene", crs="EPSG:25832")
     assert "gdalwarp -t_srs EPSG:25832" in found.value.remedy
-    write_scene(make_scene(), tmp_path / "damaged" / "scene", {}, {"road.tif": picture[:5000]})
+    write_scene(make_scene(), tmp_path / "damaged" / "scene", {}, lambda: {"road.tif": picture[:5000]})
     with pytest.raises(InputError, match=r"road.tif is damaged: it ends early"):
         exported(tmp_path / "damaged" / "scene")

@@ -44,7 +44,7 @@ def pictures() -> dict[str, bytes]:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report") / "scene"
-    write_scene(make_scene(), out, REPORT, pictures())
+    write_scene(make_scene(), out, REPORT, pictures)
     return out
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_decoding import IncompleteImageError
-from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
+from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_image_small, read_mask
 from tests.helpers.damaged_images import cut, patched_frame, png_chunks, png_of_chunks
 
 STORED = cv2.IMREAD_IGNORE_ORIENTATION
@@ -73,6 +73,23 @@ def test_gray_jpeg(tmp_path: Path, picture: np.ndarray) -> None:
     data = encoded(picture[..., 0])
     check_same_as_opencv(data, tmp_path / "a.jpg")
     check_refused(cut(data), tmp_path / "a.jpg", "truncated-image")
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize("width_px", [100, 300])
+@pytest.mark.parametrize("is_gray", [True, False])
+def test_a_small_png_is_the_image_made_smaller(
+    tmp_path: Path, picture: np.ndarray, is_gray: bool, width_px: int, bits: int
+) -> None:
+    file = tmp_path / "image.png"
+    stored = picture[..., 0] if is_gray else picture
+    assert cv2.imwrite(str(file), stored if bits == 8 else stored.astype(np.uint16) * 257)
+    for colours, read in (("RGB", read_image_rgb), ("GRAY", read_image_gray)):
+        whole = read(file)
+        size = (width_px, round(163 * width_px / 241))
+        expected = whole if width_px > 241 else cv2.resize(whole, size, interpolation=cv2.INTER_AREA)
+        small = read_image_small(file, (241, 163), width_px, colours=colours)
+        np.testing.assert_array_equal(small, expected)
 
 
 def test_every_cut_is_noticed(tmp_path: Path, picture: np.ndarray) -> None:
