@@ -16,11 +16,12 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.errors import MrasfmError
+from mrasfm_engine.errors import CancelledError, MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
@@ -111,7 +112,8 @@ def write_scene(
         check_scene(one)
     with publishing(out, sum(map(_size_bytes, scenes)), replaced=REPLACED) as work:
         parts = _Parts(units=[other.unit_registered for other, _ in components], listed=component_list(scenes))
-        _write(scene, work, report, draw, parts)
+        still_needed = sum(_size_bytes(other) for other, _ in components)
+        _write(scene, work, report, _fitting(draw, still_needed, out), parts)
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
@@ -177,10 +179,14 @@ def _write(
 ) -> None:
     read_back = ReadBack(work)
     with ThreadPoolExecutor(1) as pool:
-        beside = pool.submit(_write_beside_pictures, scene, work, parts, report.get("component", 0), read_back)
-        pictures = draw()
+        stopped = Event()
+        beside = pool.submit(_write_beside_pictures, scene, work, parts, report.get("component", 0), read_back, stopped)
+        try:
+            pictures = draw()
+        except BaseException:
+            stopped.set()
+            raise
         figures, calibrated = beside.result()
-    require_space(picture_files.size_bytes(pictures), work)
     picture_files.write_pictures(pictures, work / PICTURES_FOLDER)
     document = {**report, **({} if parts.listed is None else {"components": parts.listed}), "summary": figures}
     make_page = partial(scene_page, scene, work, document, calibrated)
@@ -191,13 +197,21 @@ def _write(
 
 
 def _write_beside_pictures(
-    scene: Scene, work: Path, parts: _Parts, component: int, read_back: ReadBack
+    scene: Scene, work: Path, parts: _Parts, component: int, read_back: ReadBack, stopped: Event
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Write and read all files that need no pictures; the report's `summary`, and `calibration.json`."""
+    """Write and read all files that need no pictures; the report's `summary`, and `calibration.json`.
+
+    Raises
+    ------
+    CancelledError
+        Between two files, once `stopped` is set.
+    """
     figures = write_common(scene, work, read_back)
+    _require_going_on(stopped)
     names = [scene.drive.manifest.name] * len(scene.unit_registered)
     others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
     figures["notes"] += others.write(work, read_back)
+    _require_going_on(stopped)
     picture_files.write_pictures(_own_car_files(scene), work / OWN_CAR_FOLDER)
     digests = {"features.db": feature_database.write_features(scene, work / "features.db")}
     if scene.road is not None:
@@ -212,8 +226,27 @@ def _write_beside_pictures(
     manifest = scene.drive.manifest.model_dump_json(exclude_none=True)
     digests[MANIFEST_FILE] = write_content(work / MANIFEST_FILE, manifest + "\n")
     read_back.expect(digests)
-    read_back.check(_checks(scene))
+    for check in _checks(scene):
+        _require_going_on(stopped)
+        read_back.check([check])
     return figures, calibrated
+
+
+def _require_going_on(stopped: Event) -> None:
+    if stopped.is_set():
+        raise CancelledError
+
+
+def _fitting(draw: Draw, needed_bytes: int, out: Path) -> Draw:
+    """The same that refuses pictures which do not fit on the disk beside other files of the scene in `out`."""
+
+    def fitting() -> PictureFiles:
+        pictures = draw()
+        home = out if out.is_dir() else out.parent
+        require_space(picture_files.size_bytes(pictures) + needed_bytes, home, what=out)
+        return pictures
+
+    return fitting
 
 
 def write_common(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any]:

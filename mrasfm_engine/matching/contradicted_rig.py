@@ -29,7 +29,12 @@ from mrasfm_engine.matching.calibration_check import (
     share_explained,
 )
 from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
-from mrasfm_engine.matching.simultaneous import are_simultaneous, calibration_sigmas, max_error_rad
+from mrasfm_engine.matching.simultaneous import (
+    are_simultaneous,
+    calibration_sigmas,
+    largest_turn_rad,
+    max_error_rad,
+)
 from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, relative_pose
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
@@ -40,8 +45,6 @@ SEARCHED_UNITS = 8
 MAX_LAG = 5  # frames that images may be late
 LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
 STEADY_TURN_DEG = 1.0
-# A turn of less is left to the calibration's own estimate, whose prior is some degrees.
-MIN_TURN_DEG, TURN_SIGMAS = 20.0, 5.0
 # What is drawn into all images of a camera, as the time of day, is at one place in most of them.
 DRAWN_PX, DRAWN_SHARE = 1.5, 0.5
 
@@ -154,9 +157,10 @@ def require_images_as_listed(
             agree = {camera for cameras in fit - lags.keys() for camera in cameras}
             spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
             raise _late(drive, lags, agree, spans)
-        sigma_deg = np.degrees(calibration_sigmas(drive, calibration)[0])
+        sigma_rad = calibration_sigmas(drive, calibration)[0]
         for cameras in contradicted:
-            least_deg = max(MIN_TURN_DEG, TURN_SIGMAS * float(np.hypot(*sigma_deg[list(cameras)])))
+            # A turn of less is left to the calibration's own estimate, whose prior is some degrees.
+            least_deg = np.degrees(largest_turn_rad(*sigma_rad[list(cameras)]))
             if compared[cameras].share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
                 raise _turned(drive, cameras, turns_deg[cameras])
 

@@ -13,7 +13,6 @@ ITERATIONS = 40
 INITIAL_DAMPING = 1e-3
 CONVERGED = 0.1  # of what errors and prior leave uncertain
 SETTLED = 0.99  # of the spread that errors had before
-WEAK_PRIOR = 1e-3  # of the prior's weight: corrections of 30 sigmas cost what one does
 MEDIAN_SIGMAS = 0.6745  # median of the absolute values of a normal distribution
 
 
@@ -39,34 +38,24 @@ class Correction:
 
 
 def most_likely_correction(
-    errors: Callable[[Floats], Sequence[Errors]], size: int, *, least_spread: Floats
+    errors: Callable[[Floats], Sequence[Errors]], start: Floats, *, least_spread: Floats, prior: float = 1.0
 ) -> Correction:
     """Minimise the errors under a Cauchy loss and a prior of unit variance by damped Gauss-Newton steps.
 
-    The spread of a group of errors is what their median says, and never rises. Where all of them are large, their
-    spread is, and they say next to nothing against the prior: it is also begun from where they lead with next to no
-    prior, and the likelier of both is the result.
+    The spread of a group of errors is what their median says, and never rises. Where all of them are large their spread
+    is too, and they say next to nothing against the prior: see `prior`.
 
     Parameters
     ----------
     errors
-        Gives the groups of errors at a correction (size,).
+        Gives the groups of errors at a correction (k,).
+    start
+        Where to begin (k,).
     least_spread
         Standard deviations (groups,) that errors have at least.
+    prior
+        Weight of the prior.
     """
-    zero = np.zeros(size)
-    near, spread = _descended(errors, zero, least_spread=least_spread)
-    afar, _ = _descended(errors, zero, least_spread=least_spread, prior=WEAK_PRIOR)
-    other, narrower = _descended(errors, afar, least_spread=least_spread)
-    least = np.minimum(spread, narrower)
-    x = min(near, other, key=lambda x: _cost(errors(x), x, least))
-    return Correction(x=x, information=_normal_equations(errors(x), x, least)[0])
-
-
-def _descended(
-    errors: Callable[[Floats], Sequence[Errors]], start: Floats, *, least_spread: Floats, prior: float = 1.0
-) -> tuple[Floats, Floats]:
-    """The nearest minimum (size,) under the prior with a weight, and the errors' spread (groups,) there."""
     x, damping = start, INITIAL_DAMPING
     here = errors(x)
     spread = _spread(here, least_spread)
@@ -84,7 +73,7 @@ def _descended(
         spread = narrower
         if settled and step @ damped @ step < CONVERGED**2:
             break
-    return x, spread
+    return Correction(x=x, information=_normal_equations(here, x, spread)[0])
 
 
 def _spread(groups: Sequence[Errors], at_least: Floats) -> Floats:
@@ -103,7 +92,7 @@ def _normal_equations(groups: Sequence[Errors], x: Floats, spread: Floats) -> tu
     return information, gradient
 
 
-def _cost(groups: Sequence[Errors], x: Floats, spread: Floats, prior: float = 1.0) -> float:
+def _cost(groups: Sequence[Errors], x: Floats, spread: Floats, prior: float) -> float:
     """Half of the Cauchy loss of the errors, and of the prior's squares with its weight."""
     cost = 0.5 * prior * float(x @ x)
     for group, sigma in zip(groups, spread, strict=True):

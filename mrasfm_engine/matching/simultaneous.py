@@ -12,11 +12,15 @@ with the Sampson distances e of `sampson`, the prior P and the variance of the k
 images demand of the rotations is used, whatever the places are: along the principal directions of their information
 against the prior, those corrections that are significant. A rig that is given well enough stays exactly as given, and
 places always do: matches say little of them.
+
+Matches that are all wrong by hundreds of pixels hardly pull, so that a camera that is many sigmas off is looked for
+from where they lead with next to no prior. A correction has to make matches fit: those of every pair of cameras no
+worse than before, and far turns most of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,12 +30,12 @@ from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.matching.relative_pose import UncertainRig
-from mrasfm_engine.matching.robust_correction import Errors, most_likely_correction
+from mrasfm_engine.matching.robust_correction import Correction, Errors, most_likely_correction
 from mrasfm_engine.matching.sampson import epipolar_derivatives
 from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.types import Cancel, Floats
+from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.findings import Finding, warning
 
 SIMULTANEOUS_US = 2_000  # cameras less apart than this are one rig: a fast car goes 6 cm
@@ -42,16 +46,25 @@ MAX_MATCHES = 2_000  # of a pair of cameras, spread over its units
 INDEPENDENT_MATCHES = 10
 MIN_SIGMA_PX = 0.5  # of a coordinate: keypoints are not better
 CLEARLY_GIVEN = 0.5  # share of the matches: one that most contradict is not the rig's calibration
+WEAK_PRIOR = 1e-3  # of the prior's weight: corrections of 30 sigmas cost what one does
+MIN_UNITS = 3  # whose matches lead far and count in full: wrong ones of one unit all agree with some relative pose
+# Shares of matches that fit, by which a correction stands: it makes nearly all fit or clearly more, and of no pair of
+# cameras fewer. A far one, by many sigmas between two cameras, has to make most of their own matches fit.
+WELL_FITTED, GAIN, FITTED_FAR = 0.9, 0.05, 0.75
+FAR_SIGMAS = 3.0
+# A turn of more is no matter of calibration: see `contradicted_rig`.
+LARGEST_TURN_DEG, LARGEST_TURN_SIGMAS = 20.0, 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SimultaneousMatches:
-    """Viewing rays (n, 3), in camera axes, of matches between simultaneous images of two cameras."""
+    """Viewing rays (n, 3), in camera axes, of matches between simultaneous images of two cameras in some units."""
 
     camera_a: int
     camera_b: int
     rays_a: Floats
     rays_b: Floats
+    units: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,19 +77,22 @@ class RigEstimate(UncertainRig):
         How many took part.
     fitted_as_given, fitted
         Shares of them that lie near their epipolar lines under the given calibration, and under the estimate.
+    is_far
+        Whether two cameras are turned against one another by many sigmas.
     """
 
     matches: int
     fitted_as_given: float
     fitted: float
+    is_far: bool = False
 
 
 def contradiction(names: Sequence[str], given: Floats, rig: RigEstimate) -> Finding | None:
-    """Finding on a calibration (c, 4, 4) under which most matches between simultaneous images would be wrong."""
-    if not rig.matches or rig.fitted_as_given >= CLEARLY_GIVEN or rig.fitted < CLEARLY_GIVEN:
+    """Finding on a calibration (c, 4, 4) that simultaneous images contradict: by most matches, or by a far turn."""
+    is_contradicted = rig.matches and rig.fitted_as_given < CLEARLY_GIVEN <= rig.fitted
+    if not (is_contradicted or rig.is_far):
         return None
-    turned = rig.rig_from_cam[:, :3, :3] @ np.swapaxes(given[:, :3, :3], 1, 2)
-    between_deg = np.degrees(np.linalg.norm(se3.log_so3(np.swapaxes(turned, 1, 2)[:, None] @ turned[None]), axis=-1))
+    between_deg = np.degrees(_turned_between(given, rig.rig_from_cam))
     a, b = sorted(int(k) for k in np.unravel_index(int(between_deg.argmax()), between_deg.shape))
     return warning(
         "calibration-contradicted",
@@ -203,7 +219,8 @@ def _pooled(
                 for kept, of_part in zip(rays, rays_of(part), strict=True):
                     kept.append(of_part[rows])
         rays_a, rays_b = map(np.concatenate, rays)
-        result.append(SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays_a, rays_b=rays_b))
+        units = sum(bool(part.inliers.any()) for part in parts)
+        result.append(SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays_a, rays_b=rays_b, units=units))
     return result
 
 
@@ -238,23 +255,77 @@ def estimate_rig(
         sigma_m=np.repeat(sigma_translation_m, 3),
         focal_px=focal_px,
     )
-    at_least = MIN_SIGMA_PX * np.array([problem.pixel_rad(one) for one in problem.found])
-    correction = most_likely_correction(problem.errors, 6 * len(rig_from_cam), least_spread=at_least)
-    turns = slice(0, 3 * len(rig_from_cam))
-    covariance = np.linalg.inv(np.eye(len(correction.x)) + correction.information)[turns, turns]
-    variance, directions = np.linalg.eigh(covariance)
-    posterior = np.sqrt(np.maximum(variance, 0.0))
-    along = directions.T @ correction.x[turns]
-    demanded = np.abs(along) > SIGNIFICANT_SIGMAS * posterior
-    refined = problem.turned(directions[:, demanded] @ along[demanded])
-    spread = (directions * posterior) * problem.sigma_rad[:, None]
+    for start in _starts(problem):
+        correction = most_likely_correction(problem.errors, start, least_spread=problem.least_spread)
+        demanded, posterior = _demanded(correction)
+        refined = problem.turned(demanded)
+        if _stands(problem, refined, max_error_px):
+            break
+    else:
+        refined, posterior = rig_from_cam, np.eye(3 * len(rig_from_cam))
+    spread = posterior * problem.sigma_rad[:, None]
     return RigEstimate(
         rig_from_cam=refined,
         covariance=_of_poses(spread @ spread.T, sigma_translation_m**2),
         matches=sum(len(one.rays_a) for one in problem.found),
         fitted_as_given=problem.share_that_fits(rig_from_cam, max_error_px),
         fitted=problem.share_that_fits(refined, max_error_px),
+        is_far=bool(problem.are_far(refined).any()),
     )
+
+
+def largest_turn_rad(sigma_a_rad: float, sigma_b_rad: float) -> float:
+    """Angle by which two cameras may be turned against one another to be a matter of calibration, by their sigmas."""
+    return max(float(np.radians(LARGEST_TURN_DEG)), LARGEST_TURN_SIGMAS * float(np.hypot(sigma_a_rad, sigma_b_rad)))
+
+
+def _starts(problem: _RigProblem) -> Iterator[Floats]:
+    """Corrections to begin from: where matches lead with next to no prior, and none."""
+    none = np.zeros(2 * len(problem.sigma_rad))
+    steady = replace(problem, found=[one for one in problem.found if one.units >= MIN_UNITS])
+    if steady.found:
+        yield most_likely_correction(steady.errors, none, least_spread=steady.least_spread, prior=WEAK_PRIOR).x
+    yield none
+
+
+def _demanded(correction: Correction) -> tuple[Floats, Floats]:
+    """The turns (3 c,) of a correction that are significant, and the root (3 c, 3 c) of the turns' covariance."""
+    turns = slice(0, len(correction.x) // 2)
+    covariance = np.linalg.inv(np.eye(len(correction.x)) + correction.information)[turns, turns]
+    variance, directions = np.linalg.eigh(covariance)
+    posterior = np.sqrt(np.maximum(variance, 0.0))
+    along = directions.T @ correction.x[turns]
+    demanded = np.abs(along) > SIGNIFICANT_SIGMAS * posterior
+    return directions[:, demanded] @ along[demanded], directions * posterior
+
+
+def _stands(problem: _RigProblem, refined: Floats, max_error_px: float) -> bool:
+    """Return whether refined poses (c, 4, 4) correct the given ones: more matches fit, and nowhere fewer."""
+    if not problem.found or np.array_equal(refined, problem.rig_from_cam):
+        return True
+    counts = np.array([len(one.rays_a) for one in problem.found])
+    before, after = (
+        problem.shares_that_fit(problem.rig_from_cam, max_error_px),
+        problem.shares_that_fit(refined, max_error_px),
+    )
+    given, fitted = counts @ before / counts.sum(), counts @ after / counts.sum()
+    if (after < before - np.maximum(GAIN, 1.0 / counts)).any():
+        return False
+    if fitted < WELL_FITTED and (fitted < CLEARLY_GIVEN or fitted < given + GAIN):
+        return False
+    turned = _turned_between(problem.rig_from_cam, refined)
+    for one, far, share in zip(problem.found, problem.are_far(refined), after, strict=True):
+        a, b = one.camera_a, one.camera_b
+        if far and (share < FITTED_FAR or turned[a, b] > largest_turn_rad(*problem.sigma_rad[[3 * a, 3 * b]])):
+            return False
+    return True
+
+
+def _turned_between(given: Floats, rig_from_cam: Floats) -> Floats:
+    """Angles (c, c) in rad by which two cameras are turned against one another from where they were given."""
+    turned = rig_from_cam[:, :3, :3] @ np.swapaxes(given[:, :3, :3], 1, 2)
+    result: Floats = np.linalg.norm(se3.log_so3(np.swapaxes(turned, 1, 2)[:, None] @ turned[None]), axis=-1)
+    return result
 
 
 def _of_poses(covariance_rad2: Floats, variance_translation_m2: Floats) -> Floats:
@@ -299,15 +370,38 @@ class _RigProblem:
                     rows=np.concatenate([rows, len(turns) + rows]),
                     error=error,
                     jacobian=np.concatenate([by_turns, by_place], axis=1),
-                    weight=min(1.0, INDEPENDENT_MATCHES / len(error)),
+                    weight=min(1.0, INDEPENDENT_MATCHES * min(1.0, one.units / MIN_UNITS) / len(error)),
                 )
             )
         return result
 
+    @property
+    def least_spread(self) -> Floats:
+        """Standard deviations (pairs,) in rad that errors have at least."""
+        return MIN_SIGMA_PX * np.array([self.pixel_rad(one) for one in self.found])
+
+    def are_far(self, rig_from_cam: Floats) -> Bools:
+        """Pairs of cameras (pairs,) that are turned against one another by many sigmas."""
+        turned = _turned_between(self.rig_from_cam, rig_from_cam)
+        sigma = self.sigma_rad[::3]
+        return np.array(
+            [
+                turned[one.camera_a, one.camera_b] > FAR_SIGMAS * np.hypot(*sigma[[one.camera_a, one.camera_b]])
+                for one in self.found
+            ],
+            dtype=np.bool_,
+        )
+
+    def shares_that_fit(self, rig_from_cam: Floats, max_error_px: float) -> Floats:
+        """Shares (pairs,) of the matches of each pair of cameras that lie near their epipolar lines."""
+        return np.array(
+            [(_errors(rig_from_cam, one) < max_error_px * self.pixel_rad(one)).mean() for one in self.found]
+        )
+
     def share_that_fits(self, rig_from_cam: Floats, max_error_px: float) -> float:
         """Share of all matches that lie near their epipolar lines."""
-        fits = [(_errors(rig_from_cam, one) < max_error_px * self.pixel_rad(one)).sum() for one in self.found]
-        return float(sum(fits) / max(sum(len(one.rays_a) for one in self.found), 1))
+        counts = np.array([len(one.rays_a) for one in self.found])
+        return float(counts @ self.shares_that_fit(rig_from_cam, max_error_px) / counts.sum()) if len(counts) else 0.0
 
     def pixel_rad(self, one: SimultaneousMatches) -> float:
         """Angle of a pixel of the coarser of two cameras."""

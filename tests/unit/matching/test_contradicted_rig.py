@@ -181,7 +181,10 @@ def test_of_three_cameras_the_late_one_is_named() -> None:
     assert f"Move the images of {names[2]} by 1 frame" in caught.value.remedy
 
 
-@pytest.mark.parametrize(("axis", "turn_deg"), [((0, 0, 1), 180.0), ((0, 0, 1), 90.0), ((0, 1, 0), 45.0)])
+@pytest.mark.parametrize(
+    ("axis", "turn_deg"),
+    [((0, 0, 1), 180.0), ((0, 0, 1), 90.0), ((0, 1, 0), 45.0), ((1, 0, 0), 22.0), ((0, 0, 1), 25.0)],
+)
 def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_angle(
     axis: tuple[float, float, float], turn_deg: float
 ) -> None:
@@ -191,7 +194,7 @@ def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_
     assert f"turned by {turn_deg:.0f} deg" in caught.value.what
 
 
-@pytest.mark.parametrize("turn_deg", [1.0, 5.0])
+@pytest.mark.parametrize("turn_deg", [1.0, 5.0, 18.0])
 def test_a_camera_that_is_a_little_off_is_left_to_the_calibrations_own_estimate(turn_deg: float) -> None:
     street(given=turned(1, (1, 0, 0), turn_deg)).check()
 

@@ -98,6 +98,45 @@ def test_a_camera_that_is_turned_far_beyond_its_prior_is_found(axis: int) -> Non
     assert contradiction([c.name for c in simulated.drive.cameras], simulated.drive.rig_from_cam, rig) is not None
 
 
+@pytest.mark.parametrize(("units", "found"), [(1, False), (6, True)])
+def test_matches_of_one_unit_that_all_agree_turn_no_camera_far(units: int, found: bool) -> None:
+    """What one unit shows of two cameras may be a lorry's side, or one facade taken for another."""
+    simulated = turned(1, [0.0, 0.0, 0.0])
+    given, rng = simulated.drive.rig_from_cam, np.random.default_rng(1)
+    wrong = given.copy()
+    wrong[1, :3, :3] = given[1, :3, :3] @ se3.exp_so3(np.array([15.0, 0.0, 0.0]) * DEG)
+    points_m = (
+        wrong[1] @ np.concatenate([rng.uniform(-4, 4, (40, 2)), np.full((40, 1), 9.0), np.ones((40, 1))], 1).T
+    ).T
+    rays = [
+        (pose[:3, :3].T @ (points_m[:, :3] - pose[:3, 3]).T).T + rng.normal(0, 1e-3, (40, 3))
+        for pose in (wrong[0], wrong[1])
+    ]
+    rays = [one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]
+    matches = SimultaneousMatches(camera_a=0, camera_b=1, rays_a=rays[0], rays_b=rays[1], units=units)
+    rig = estimate_rig(
+        given, [matches], sigma_rotation_rad=np.full(6, 2.0 * DEG), sigma_translation_m=np.full(6, 0.05),
+        focal_px=np.full(6, 700.0), max_error_px=4.0,
+    )  # fmt: skip
+    assert rig.is_far == found
+    if not found:
+        np.testing.assert_array_equal(rig.rig_from_cam, given)
+
+
+def test_a_correction_under_which_fewer_matches_fit_is_none() -> None:
+    """Focal lengths that are 5 % short bend epipolar lines as no rotation does."""
+    simulated = make_simulated_drive(units=6, cameras=2, points=2000)
+    rays_of = rays_of_matches(simulated)
+
+    def stretched(pair: PairMatches) -> tuple[np.ndarray, np.ndarray]:
+        rays = [one * np.array([1.05, 1.05, 1.0]) for one in rays_of(pair)]
+        return rays[0] / np.linalg.norm(rays[0], axis=1)[:, None], rays[1] / np.linalg.norm(rays[1], axis=1)[:, None]
+
+    pairs = true_matches(simulated, window=0)
+    rig = rig_of_drive(simulated.drive, pairs, stretched, MatchConfig(), BundleAdjustmentConfig())
+    assert rig.fitted >= rig.fitted_as_given - 1e-9
+
+
 def test_what_was_found_is_said_where_most_matches_contradict_the_calibration() -> None:
     given = make_simulated_drive(units=6, cameras=2, points=2000).drive.rig_from_cam
     estimated = given.copy()
@@ -126,7 +165,7 @@ def test_cameras_at_one_place_and_matches_of_nothing_do_no_harm() -> None:
     given[:, :3, 3] = given[0, :3, 3]
     rays = rng.normal(size=(2, 300, 3)) + np.array([0, 0, 3])
     rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-    found = [SimultaneousMatches(camera_a=0, camera_b=1, rays_a=rays[0], rays_b=rays[1])]
+    found = [SimultaneousMatches(camera_a=0, camera_b=1, rays_a=rays[0], rays_b=rays[1], units=6)]
     sigmas = np.full(6, 2.0 * DEG), np.full(6, 0.05)
     rig = estimate_rig(
         given, found, sigma_rotation_rad=sigmas[0], sigma_translation_m=sigmas[1], focal_px=np.full(6, 700.0),
