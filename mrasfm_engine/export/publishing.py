@@ -207,8 +207,8 @@ def _prepare(needed: int, out: Path, home: Path) -> None:
     require_space(needed, home, what=out)
 
 
-def require_space(needed_bytes: int, folder: Path, *, what: Path | None = None) -> None:
-    """Refuse to write what does not fit on the disk of a folder; the message names `what`, or the folder.
+def require_space(needed_bytes: int, folder: Path, *, what: Path) -> None:
+    """Refuse to write what does not fit on the disk of a folder; the message names `what`.
 
     Raises
     ------
@@ -218,7 +218,7 @@ def require_space(needed_bytes: int, folder: Path, *, what: Path | None = None) 
     free = shutil.disk_usage(folder).free
     if free < needed_bytes:
         raise StorageError(
-            f"{what or folder} needs about {needed_bytes / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
+            f"{what} needs about {needed_bytes / 1e6:.0f} MB and its disk has {free / 1e6:.0f} MB free",
             remedy="Free space on this disk, or choose another folder.",
         )
 

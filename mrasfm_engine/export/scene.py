@@ -113,7 +113,13 @@ def write_scene(
     with publishing(out, sum(map(_size_bytes, scenes)), replaced=REPLACED) as work:
         parts = _Parts(units=[other.unit_registered for other, _ in components], listed=component_list(scenes))
         still_needed = sum(_size_bytes(other) for other, _ in components)
-        _write(scene, work, report, _fitting(draw, still_needed, out), parts)
+
+        def draw_what_fits() -> PictureFiles:
+            pictures = draw()
+            require_space(picture_files.size_bytes(pictures) + still_needed, work, what=out)
+            return pictures
+
+        _write(scene, work, report, draw_what_fits, parts)
         for number, (other, own_report) in enumerate(components, start=1):
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
@@ -235,18 +241,6 @@ def _write_beside_pictures(
 def _require_going_on(stopped: Event) -> None:
     if stopped.is_set():
         raise CancelledError
-
-
-def _fitting(draw: Draw, needed_bytes: int, out: Path) -> Draw:
-    """The same that refuses pictures which do not fit on the disk beside other files of the scene in `out`."""
-
-    def fitting() -> PictureFiles:
-        pictures = draw()
-        home = out if out.is_dir() else out.parent
-        require_space(picture_files.size_bytes(pictures) + needed_bytes, home, what=out)
-        return pictures
-
-    return fitting
 
 
 def write_common(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any]:

@@ -304,11 +304,8 @@ def _stands(problem: _RigProblem, refined: Floats, max_error_px: float) -> bool:
     if not problem.found or np.array_equal(refined, problem.rig_from_cam):
         return True
     counts = np.array([len(one.rays_a) for one in problem.found])
-    before, after = (
-        problem.shares_that_fit(problem.rig_from_cam, max_error_px),
-        problem.shares_that_fit(refined, max_error_px),
-    )
-    given, fitted = counts @ before / counts.sum(), counts @ after / counts.sum()
+    before, after = (problem.shares_that_fit(rig, max_error_px) for rig in (problem.rig_from_cam, refined))
+    given, fitted = (counts @ shares / counts.sum() for shares in (before, after))
     if (after < before - np.maximum(GAIN, 1.0 / counts)).any():
         return False
     if fitted < WELL_FITTED and (fitted < CLEARLY_GIVEN or fitted < given + GAIN):

@@ -1,76 +1,62 @@
-"""The outline of the own car in judged pixels: which edges are enough, and which areas are sure."""
+"""Steps of the change over time: of two surfaces, and of few images alone."""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
-from mrasfm_engine.features.own_car import MIN_EVIDENCE_PX, MIN_EVIDENCE_SHARE
-from mrasfm_engine.features.static_outline import Part, StaticEdges, trace_outline
+from mrasfm_engine.features import static_outline
+from mrasfm_engine.features.static_outline import StaticEdges
 
-HEIGHT, WIDTH, EDGE_ROW = 120, 160, 90
-CHANGE_OF_WORLD = 0.2
+SHAPE = (120, 160)
+DETAIL_PX = 2.0  # sigma: neighbours change alike, so that chance looks like surfaces
 
 
-def edges(*, lasting: float, change: float, gap: slice = slice(0, 0), across: float = 1.0) -> StaticEdges:
-    """A bonnet below an edge from side to side: what stays of it, and how much its paint changes."""
-    layers = {
-        name: np.zeros((HEIGHT, WIDTH), np.float32)
-        for name in ("lasting", "across", "strength", "step", "step_evidence")
-    }
-    layers["lasting"][EDGE_ROW - 2 : EDGE_ROW + 1] = lasting
-    layers["across"][EDGE_ROW - 2 : EDGE_ROW + 1] = across
-    layers["strength"][EDGE_ROW - 1] = 5.0
-    changes = np.full((HEIGHT, WIDTH), CHANGE_OF_WORLD, np.float32)
-    changes[EDGE_ROW:] = change
-    layers["lasting"][:, gap], changes[:, gap] = 0.0, CHANGE_OF_WORLD
-    return StaticEdges(
-        **layers,
-        edge=np.clip(layers["lasting"] - 1, 0, 1),
-        always=np.ones((HEIGHT, WIDTH), np.float32),
-        change=changes,
-        fall=np.full((HEIGHT, WIDTH), 0.3, np.float32),
+def edges(changes: np.ndarray, count: int) -> StaticEdges:
+    """Edges where nothing but the changes (2, h, w) tells surfaces apart, on ground near everywhere."""
+    return StaticEdges.from_sums(
+        np.zeros((4, 2, *SHAPE, 3), np.float32),
+        np.ones(SHAPE, np.float32),
+        changes,
+        count,
+        fall=np.full(SHAPE, 0.3),
+        flow=np.tile([0.0, 1.0], (*SHAPE, 1)),
     )
 
 
-def sure(parts: list[Part]) -> list[Part]:
-    return [p for p in parts if p.evidence_px >= MIN_EVIDENCE_PX and p.evidence_share >= MIN_EVIDENCE_SHARE]
+def seen(of_upper: float, of_lower: float, count: int) -> np.ndarray:
+    """Changes (2, h, w) that halves of some images show of two surfaces, the upper 60 rows and what is below."""
+    change = np.where(np.arange(SHAPE[0])[:, None] < 60, of_upper, of_lower)
+    rng = np.random.default_rng(count)
+    frames = [cv2.GaussianBlur(rng.normal(0.0, 1.0, SHAPE), (0, 0), DETAIL_PX) for _ in range(count)]
+    frames = [change * frame / np.std(frame) for frame in frames]
+    return np.asarray([np.std(frames[k::2], axis=0) for k in range(2)], dtype=np.float32)
 
 
-@pytest.mark.parametrize(
-    ("lasting", "change", "found"),
-    [
-        (2.0, CHANGE_OF_WORLD, True),  # an edge for sure, whatever changes
-        (0.8, CHANGE_OF_WORLD, False),  # less than the world keeps, on one surface
-        (0.8, CHANGE_OF_WORLD / 4, True),  # enough where a surface begins that changes less
-        (0.4, CHANGE_OF_WORLD / 4, False),  # not even half of what an edge keeps
-    ],
-)
-def test_less_of_an_edge_is_enough_where_the_surface_below_changes_less(
-    lasting: float, change: float, found: bool
-) -> None:
-    parts = sure(trace_outline(edges(lasting=lasting, change=change)))
-    assert bool(parts) == found
-    if found:
-        np.testing.assert_allclose(parts[0].mask.sum(0), HEIGHT - EDGE_ROW, atol=1)
+@pytest.mark.parametrize("count", [12, 16, 30, 64])
+def test_a_few_images_alone_make_no_step(count: int) -> None:
+    assert (edges(seen(0.2, 0.2, count), count).step > 0).mean() < 0.01
 
 
-def test_edges_along_the_motion_are_no_evidence() -> None:
-    assert not sure(trace_outline(edges(lasting=2.0, change=CHANGE_OF_WORLD / 4, across=0.0)))
+def test_without_that_they_make_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(static_outline, "STEP_SIGMAS", 0.0)
+    assert (edges(seen(0.2, 0.2, 12), 12).step > 0).mean() > 0.2
 
 
-def test_every_area_has_to_have_evidence_of_its_own() -> None:
-    left, right = trace_outline(edges(lasting=2.0, change=CHANGE_OF_WORLD / 4, gap=slice(30, 80)))
-    assert not (left.mask & right.mask).any()
-    assert left.mask.any(0).sum() == pytest.approx(30, abs=2)
-    assert left.evidence_px == pytest.approx(30, abs=2)
-    assert right.evidence_px == pytest.approx(80, abs=2)
+def test_pixels_that_never_change_tell_nothing_of_the_others() -> None:
+    changes = seen(0.2, 0.2, 12)
+    changes[:, :, :100] = 0.0
+    assert (edges(changes, 12).step[:, 110:] > 0).mean() < 0.01
 
 
-def test_a_narrow_gap_is_closed() -> None:
-    (whole,) = trace_outline(edges(lasting=2.0, change=CHANGE_OF_WORLD / 4, gap=slice(70, 74)))
-    assert whole.mask[-1].all()
+@pytest.mark.parametrize("count", [12, 16, 30, 64])
+def test_a_surface_that_changes_by_a_quarter_makes_one(count: int) -> None:
+    step = edges(seen(0.4, 0.1, count), count).step
+    assert (step[58:62, 5:-5].max(0) > 0.3).mean() > 0.9
+    assert (step[:50] > 0).mean() < 0.02
 
 
-def test_where_nothing_stays_there_is_no_area() -> None:
-    assert trace_outline(edges(lasting=0.0, change=CHANGE_OF_WORLD)) == []
+def test_with_many_images_half_of_the_change_is_a_step() -> None:
+    step = edges(seen(0.2, 0.1, 64), 64).step
+    assert (step[58:62, 5:-5].max(0) > 0).mean() > 0.95
