@@ -17,7 +17,7 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import voted_out
 from mrasfm_engine.mapping.moving_objects import REASONS, MovingTracks
 from mrasfm_engine.mapping.receiver_fit import Placement
-from mrasfm_engine.mapping.refinement import Refinement
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.scene.road import RoadSource

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
-    Covariances,
     covariances,
 )
-from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
-from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
+from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
@@ -26,7 +21,6 @@ from mrasfm_engine.mapping.calibration import (
     has_few_units,
     hold_baselines,
     observed_directions,
-    of_cameras_alone,
     resolve_scale,
     sigma_scale_of_images,
     take_calibration,
@@ -35,27 +29,27 @@ from mrasfm_engine.mapping.georeferencing import BENT
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
 from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
 from mrasfm_engine.mapping.intrinsics import (
-    IntrinsicsDecision,
     assess_intrinsics,
     held_intrinsics,
     intrinsics_may_vary,
-    intrinsics_prior,
 )
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
     MIN_OTHERS,
-    MiscalibratedPair,
-    Miscalibration,
     find_miscalibrations,
     find_wrong_pair,
 )
-from mrasfm_engine.mapping.moving_objects import MovingTracks, drop_moving
+from mrasfm_engine.mapping.moving_objects import drop_moving
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
-from mrasfm_engine.mapping.receiver_fit import Placement
-from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road, road_where_points_are
+from mrasfm_engine.mapping.refinement_result import (
+    Refinement,
+    certainty_of,
+    free_units_of,
+    solver_options,
+    terms_of,
+)
+from mrasfm_engine.mapping.road import drop_off_road, road_where_points_are
 from mrasfm_engine.mapping.time_offsets import (
-    SIGMA_READOUT_S,
-    TimeCertainty,
     assess_times,
     interpolation_error_s,
     positions_may_tell_time,
@@ -63,70 +57,15 @@ from mrasfm_engine.mapping.time_offsets import (
     time_findings,
     time_prior,
     times_may_vary,
-    undeclared_readouts,
 )
 from mrasfm_engine.types import Bools, Cancel, CountProgress
-from schemas.findings import Finding
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
-TOLERANCE = 1e-6
-DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
-ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
 BEHIND = 0.1  # of an observation's sigma, beyond which a scene that stayed behind its baselines is adjusted
-INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
-
-
-@dataclass(kw_only=True)
-class Refinement:
-    """Result of the refinement."""
-
-    sigma_px: float = 1.0
-    absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
-    calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
-    given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
-    intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
-    is_of_one_camera: bool = False  # whose intrinsics may vary, at its place in the rig as given
-    times_vary: bool = False
-    mean_time_varies: bool = False
-    times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
-    recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
-    adjustments: list[Report] = field(default_factory=list)
-    observations_dropped: int = 0
-    points_dropped: int = 0
-    units_dropped: list[int] = field(default_factory=list)
-    certainty: Covariances | None = None
-    directions: Observability | None = None  # of the cameras' poses; None where it is not known
-    held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
-    held_times: Bools | None = None  # (cameras,) time offsets that were not observed and stay zero
-    miscalibrations: list[Miscalibration] = field(default_factory=list)
-    late_cameras: list[Finding] = field(default_factory=list)
-    wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
-    moving: MovingTracks = field(default_factory=MovingTracks)
-    road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
-
-    @property
-    def intrinsics_vary(self) -> bool:
-        """True where any camera's intrinsics are free."""
-        return self.intrinsics is not None and bool(self.intrinsics.free.any())
-
-    @property
-    def placement(self) -> Placement | None:
-        """Fit of the receiver's positions, where these were to be used."""
-        return self.absolute.placement
-
-    @property
-    def placed_by_rough_poses(self) -> bool:
-        """The scene stands where rough poses say."""
-        return self.absolute.placed_by_rough_poses
-
-    @property
-    def georeferenced(self) -> bool:
-        """The scene stands where the receiver says."""
-        return self.absolute.positions is not None
 
 
 def refine(
@@ -146,8 +85,20 @@ def refine(
     calibrated
         A larger, refined scene of the same drive, whose calibration this one takes.
     """
-    absolute = AbsolutePriors() if absolute is None else absolute
-    result = Refinement(absolute=absolute)
+    result = Refinement(absolute=AbsolutePriors() if absolute is None else absolute)
+    _place(mapper, result, calibrated, cancel)
+    free_units = free_units_of(mapper, result.absolute)
+    result.moving = drop_moving(mapper)
+    result.sigma_px = observation_sigma_px(mapper)
+    _decide_what_varies(mapper, result, free_units, is_calibrated=calibrated is not None, cancel=cancel)
+    _adjust_in_rounds(mapper, result, free_units, progress, cancel)
+    _assess(mapper, result, free_units, cancel)
+    return result
+
+
+def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel: Cancel | None) -> None:
+    """Put the scene where positions or rough poses say, and take the calibration of a larger scene, if there is one."""
+    absolute = result.absolute
     absolute.place(mapper)
     if absolute.positions_are_refused:
         _compare_positions_again(mapper, result, cancel)
@@ -164,46 +115,55 @@ def refine(
     if calibrated is not None:
         take_calibration(mapper, calibrated)
         mapper.complete()
-    free_units = _free_units(mapper, absolute)
-    result.moving = drop_moving(mapper)
-    result.sigma_px = observation_sigma_px(mapper)
-    if calibrated is not None:
+
+
+def _decide_what_varies(
+    mapper: Mapper, result: Refinement, free_units: Bools, *, is_calibrated: bool, cancel: Cancel | None
+) -> None:
+    """Decide which of calibration, time offsets and intrinsics vary, and what else says the scale."""
+    if is_calibrated:
         result.calibration = CalibrationDecision(False, OF_THE_LARGEST)
     else:
         result.calibration = assess_calibration(
             mapper,
             free_units=free_units,
-            terms=_terms(mapper, result),
+            terms=terms_of(mapper, result),
             georeferenced=result.georeferenced,
-            options=_options(mapper, result.sigma_px),
+            options=solver_options(mapper, result.sigma_px),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     few = not result.georeferenced and _reassesses(mapper) and has_few_units(mapper)
     if result.calibration.free and few:
         _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
-    if result.times_vary and absolute.positions is not None:
-        result.mean_time_varies = positions_may_tell_time(mapper, absolute.positions)
-        absolute.clock_varies = result.mean_time_varies
+    if result.times_vary and result.absolute.positions is not None:
+        result.mean_time_varies = positions_may_tell_time(mapper, result.absolute.positions)
+        result.absolute.clock_varies = result.mean_time_varies
     if result.calibration.free and not result.georeferenced and not few and _reassesses(mapper):
         result.given_scale = scale_of_given_rotations(
             mapper,
             free_units=free_units,
             free_times=result.recalibrated if result.times_vary else None,
-            terms=_terms(mapper, result),
-            options=_options(mapper, result.sigma_px),
+            terms=terms_of(mapper, result),
+            options=solver_options(mapper, result.sigma_px),
         )
     result.intrinsics = held_intrinsics(mapper)
-    if calibrated is None and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
+    if not is_calibrated and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
         result.is_of_one_camera = mapper.drive.has_single_camera
         result.intrinsics = assess_intrinsics(
             mapper,
             free_units=free_units,
-            terms=_terms(mapper, result),
-            options=_options(mapper, result.sigma_px),
+            terms=terms_of(mapper, result),
+            options=solver_options(mapper, result.sigma_px),
             cancel=cancel,
         )
-    _rescale(mapper, result, _terms(mapper, result))
+
+
+def _adjust_in_rounds(
+    mapper: Mapper, result: Refinement, free_units: Bools, progress: CountProgress | None, cancel: Cancel | None
+) -> None:
+    """Adjust, triangulate anew and filter, until the weights of positions are steady."""
+    _rescale(mapper, result, terms_of(mapper, result))
     steady = _unbend(mapper, result, free_units, cancel)
     done, is_last = 0, False
     while not is_last:
@@ -211,18 +171,7 @@ def refine(
         is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
         _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
         steady = _reassess(mapper, result)
-        if is_last:
-            mapper.readmit()
-        else:
-            mapper.complete()
-        observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
-        if is_last:
-            result.moving = drop_moving(mapper)
-        else:
-            mapper.drop(result.moving.tracks)
-        if mapper.config.mapping.semantic_triangulation:
-            result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
-        result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
+        _choose_observations(mapper, result, is_last=is_last)
         if mapper.registered.sum() < 2:
             raise ReconstructionError(
                 "adjusted together, no two units keep enough of what they observe: images contradict one another, "
@@ -230,36 +179,56 @@ def refine(
                 remedy="Check the times of images and positions, and rig.cameras.",
                 code="contradictory-drive",
             )
-        result.observations_dropped += observations
-        result.points_dropped += points
         done += 1
         if progress is not None:
             progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
-    result.certainty = _with_lens_errors(result, _certainty(mapper, result))
+
+
+def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -> None:
+    """Take up what fits the adjusted scene, and drop what does not, what moves, and what is off the road's surface."""
+    if is_last:
+        mapper.readmit()
+    else:
+        mapper.complete()
+    observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
+    result.observations_dropped += observations
+    result.points_dropped += points
+    if is_last:
+        result.moving = drop_moving(mapper)
+    else:
+        mapper.drop(result.moving.tracks)
+    if mapper.config.mapping.semantic_triangulation:
+        result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
+    result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
+
+
+def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
+    """Say how certain everything is, hold what the drive does not observe, and find what is not as it was given."""
+    result.certainty = certainty_of(mapper, result)
     result.directions = observed_directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
         result.mean_time_varies &= positions_tell_time(mapper, result.certainty)
         prior = time_prior(mapper, mean_varies=result.mean_time_varies)
         result.times = assess_times(prior, result.certainty, interpolation_error_s(mapper))
-    if result.recalibrated.any() and result.directions is not None:
-        _hold_unobserved(
-            mapper,
-            result,
-            free_units & mapper.registered,
-            holds_mean_time=mean_time_varied and not result.mean_time_varies,
-            cancel=cancel,
-        )
-        result.road = road_where_points_are(mapper, result.road)
-        if result.times is not None:
-            offset_s = mapper.state.camera_time_offset_s
-            prior = time_prior(mapper, mean_varies=result.mean_time_varies)
-            result.late_cameras = time_findings(mapper.drive, offset_s, prior, result.times)
-        known = calibration_prior(mapper), mapper.state, result.directions
-        result.miscalibrations = find_miscalibrations(*known)
-        result.wrong_pair = find_wrong_pair(*known)
-    return result
+    if not result.recalibrated.any() or result.directions is None:
+        return
+    _hold_unobserved(
+        mapper,
+        result,
+        free_units & mapper.registered,
+        holds_mean_time=mean_time_varied and not result.mean_time_varies,
+        cancel=cancel,
+    )
+    result.road = road_where_points_are(mapper, result.road)
+    if result.times is not None:
+        offset_s = mapper.state.camera_time_offset_s
+        prior = time_prior(mapper, mean_varies=result.mean_time_varies)
+        result.late_cameras = time_findings(mapper.drive, offset_s, prior, result.times)
+    known = calibration_prior(mapper), mapper.state, result.directions
+    result.miscalibrations = find_miscalibrations(*known)
+    result.wrong_pair = find_wrong_pair(*known)
 
 
 def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel | None) -> None:
@@ -270,7 +239,7 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     settings, absolute = mapper.config.bundle_adjustment, result.absolute
     if mapper.drive.has_single_camera or not (_reassesses(mapper) and settings.camera_set_adjustment):
         return
-    free_units, options = _free_units(mapper, absolute), _options(mapper, observation_sigma_px(mapper))
+    free_units, options = free_units_of(mapper, absolute), solver_options(mapper, observation_sigma_px(mapper))
     terms = absolute.terms(mapper)
     result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
     mapper.complete()
@@ -298,7 +267,7 @@ def _adjust(
     cancel: Cancel | None,
 ) -> None:
     """Adjust everything that varies, with all priors."""
-    terms = _terms(mapper, result)
+    terms = terms_of(mapper, result)
     result.adjustments.append(
         adjust_poses(
             mapper,
@@ -307,7 +276,7 @@ def _adjust(
             free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
             free_times=result.recalibrated if result.times_vary else None,
             terms=terms,
-            options=_options(mapper, result.sigma_px, rough=rough),
+            options=solver_options(mapper, result.sigma_px, rough=rough),
             an_image=mapper.config.mapping.pose_observations if rough else 0,
             cancel=cancel,
         )
@@ -359,8 +328,8 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
     problem, _ = mapper.problem(
         free_units,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-        terms=_terms(mapper, result),
-        options=_options(mapper, result.sigma_px),
+        terms=terms_of(mapper, result),
+        options=solver_options(mapper, result.sigma_px),
     )
     found = observed_directions(mapper, covariances(problem, problem.state, shared_errors=False))
     wrong = np.zeros_like(result.recalibrated)
@@ -401,7 +370,7 @@ def _hold_unobserved(
         _adjust(mapper, result, free_units, rough=False, cancel=cancel)
         behind_px = hold_baselines(mapper, result.certainty) if hold_scale else 0.0
     if behind_px > BEHIND * result.sigma_px:  # units and points are no longer where the images want them
-        terms, options = result.absolute.terms(mapper), _options(mapper, result.sigma_px)
+        terms, options = result.absolute.terms(mapper), solver_options(mapper, result.sigma_px)
         result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
 
 
@@ -410,86 +379,3 @@ def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:
     several = not mapper.drive.has_single_camera
     if result.calibration.free and several and terms and mapper.config.bundle_adjustment.camera_set_adjustment:
         resolve_scale(mapper, terms)
-
-
-def _options(mapper: Mapper, sigma_px: float, *, rough: bool = False) -> SolverOptions:
-    return SolverOptions(
-        max_iterations=15 if rough else 40,
-        function_tolerance=TOLERANCE,
-        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
-        initial_damping=INITIAL_DAMPING,
-        loss_scale=mapper.config.bundle_adjustment.loss_scale,
-        sigma_px=sigma_px,
-        threads=mapper.config.threads,
-    )
-
-
-def _free_units(mapper: Mapper, absolute: AbsolutePriors) -> Bools:
-    """All registered units; where nothing else holds the frame, the first one does."""
-    free = mapper.registered.copy()
-    if not (absolute.hold_the_frame and mapper.config.bundle_adjustment.priors):
-        free[np.flatnonzero(free)[0]] = False
-    return free
-
-
-def _terms(mapper: Mapper, result: Refinement) -> list[Term]:
-    terms: list[Term] = []
-    if not mapper.config.bundle_adjustment.priors:
-        return terms
-    if result.calibration.free:
-        terms.append(calibration_prior(mapper, result.held))
-        terms += [] if result.given_scale is None else [result.given_scale]
-    elif result.recalibrated.any():
-        # The cameras that stay hold the gauge.
-        of_others = (~result.recalibrated).astype(np.float64)
-        terms.append(replace(calibration_prior(mapper, result.held), gauge_weights=of_others))
-    if result.is_of_one_camera:
-        terms.append(calibration_prior(mapper, np.ones((1, 6), dtype=np.bool_)))
-    if result.intrinsics_vary:
-        terms.append(intrinsics_prior(mapper))
-    if result.times_vary:
-        terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
-    return terms + result.absolute.terms(mapper)
-
-
-def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Covariances | None:
-    """The certainty with what lens models and given rotations leave open of the scale, where positions do not tell."""
-    if certainty is None or result.given_scale is None:
-        return certainty
-    return replace(certainty, sigma_scale=float(np.hypot(certainty.sigma_scale, result.given_scale.sigma_scale)))
-
-
-def _certainty(mapper: Mapper, result: Refinement) -> Covariances | None:
-    """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
-
-    None where they would not be those of what was adjusted, and where there is too much for an inverse.
-    """
-    if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
-        return None
-    several = not mapper.drive.has_single_camera
-    is_kept = result.calibration.free or result.is_of_one_camera
-    terms = [term for term in _terms(mapper, result) if is_kept or not isinstance(term, CalibrationPrior)]
-    if several and not result.calibration.free:
-        terms.append(calibration_prior(mapper))
-    free_intrinsics = None
-    if result.intrinsics is not None and result.intrinsics.asked:
-        # Whoever lets the focal length vary is not certain of the others either.
-        free_intrinsics = np.ones((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_)
-        if not result.intrinsics_vary:
-            terms.append(intrinsics_prior(mapper))
-    times_vary = several and times_may_vary(mapper)
-    if times_vary:
-        terms += [] if result.times_vary else [time_prior(mapper, mean_varies=False)]
-        terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
-    problem, _ = mapper.problem(
-        _free_units(mapper, result.absolute),
-        free_cameras=np.full(len(mapper.camera_kind), several or result.is_of_one_camera),
-        free_intrinsics=free_intrinsics,
-        free_times=np.full(len(mapper.camera_kind), times_vary),
-        free_readouts=undeclared_readouts(mapper) & times_vary,
-        terms=terms,
-        options=_options(mapper, result.sigma_px),
-    )
-    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
-        return None
-    return of_cameras_alone(mapper, covariances(problem, problem.state))

@@ -12,7 +12,7 @@ from mrasfm_engine.geometry.camera_model import unpack_camera
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.keyframes import nearest_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.refinement import Refinement
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.scene import (

@@ -20,7 +20,8 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.triangulation.tracks import Keypoints

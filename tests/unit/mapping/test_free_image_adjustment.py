@@ -17,7 +17,8 @@ from mrasfm_engine.mapping.calibration import assess_calibration, calibration_pr
 from mrasfm_engine.mapping.free_image_adjustment import MIN_OBSERVATIONS, terms_of_images
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
 
 UNITS, CAMERAS = 10, 6

@@ -11,7 +11,8 @@ from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping import refinement
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapping_report import scale_findings
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,

@@ -18,7 +18,8 @@ from mrasfm_engine.mapping.miscalibration import (
     pair_finding,
     voted_out,
 )
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.unit_registration import Registration
 from tests.helpers.simulated_drive import (
     SimulatedDrive,

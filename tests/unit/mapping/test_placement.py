@@ -15,7 +15,8 @@ from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import place_by_gnss
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors, most_likely_errors, receiver_errors
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,

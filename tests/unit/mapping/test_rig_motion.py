@@ -11,7 +11,7 @@ from mrasfm_engine.mapping.calibration import scale_with_baselines
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe_refinement, motion_findings
-from mrasfm_engine.mapping.refinement import Refinement
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.unit_registration import register_unit
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.synthetic.simulate import poses_along

@@ -8,7 +8,8 @@ import pytest
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.refinement import Refinement, refine
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.time_offsets import time_prior, times_may_vary
 from tests.helpers.simulated_drive import (
     SimulatedDrive,

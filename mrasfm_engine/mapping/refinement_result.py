@@ -1,0 +1,173 @@
+"""Decisions and results of the refinement, and the terms, options and certainty that follow from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.marginal_covariances import (
+    MAX_UNKNOWNS_FOR_COVARIANCE,
+    Covariances,
+    covariances,
+)
+from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
+from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.calibration import CalibrationDecision, calibration_prior, of_cameras_alone
+from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, intrinsics_prior
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.miscalibration import MiscalibratedPair, Miscalibration
+from mrasfm_engine.mapping.moving_objects import MovingTracks
+from mrasfm_engine.mapping.receiver_fit import Placement
+from mrasfm_engine.mapping.road import RoadAssessment
+from mrasfm_engine.mapping.time_offsets import (
+    SIGMA_READOUT_S,
+    TimeCertainty,
+    time_prior,
+    times_may_vary,
+    undeclared_readouts,
+)
+from mrasfm_engine.types import Bools
+from schemas.findings import Finding
+
+TOLERANCE = 1e-6
+DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
+ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
+INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
+
+
+@dataclass(kw_only=True)
+class Refinement:
+    """Result of the refinement."""
+
+    sigma_px: float = 1.0
+    absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
+    calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
+    given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
+    intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
+    is_of_one_camera: bool = False  # whose intrinsics may vary, at its place in the rig as given
+    times_vary: bool = False
+    mean_time_varies: bool = False
+    times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
+    recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
+    adjustments: list[Report] = field(default_factory=list)
+    observations_dropped: int = 0
+    points_dropped: int = 0
+    units_dropped: list[int] = field(default_factory=list)
+    certainty: Covariances | None = None
+    directions: Observability | None = None  # of the cameras' poses; None where it is not known
+    held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
+    held_times: Bools | None = None  # (cameras,) time offsets that were not observed and stay zero
+    miscalibrations: list[Miscalibration] = field(default_factory=list)
+    late_cameras: list[Finding] = field(default_factory=list)
+    wrong_pair: MiscalibratedPair | None = None  # of a rig of two cameras
+    moving: MovingTracks = field(default_factory=MovingTracks)
+    road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
+
+    @property
+    def intrinsics_vary(self) -> bool:
+        """True where any camera's intrinsics are free."""
+        return self.intrinsics is not None and bool(self.intrinsics.free.any())
+
+    @property
+    def placement(self) -> Placement | None:
+        """Fit of the receiver's positions, where these were to be used."""
+        return self.absolute.placement
+
+    @property
+    def placed_by_rough_poses(self) -> bool:
+        """The scene stands where rough poses say."""
+        return self.absolute.placed_by_rough_poses
+
+    @property
+    def georeferenced(self) -> bool:
+        """The scene stands where the receiver says."""
+        return self.absolute.positions is not None
+
+
+def solver_options(mapper: Mapper, sigma_px: float, *, rough: bool = False) -> SolverOptions:
+    """Options of adjustments whose observations have that standard deviation; `rough` ones end earlier."""
+    return SolverOptions(
+        max_iterations=15 if rough else 40,
+        function_tolerance=TOLERANCE,
+        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
+        initial_damping=INITIAL_DAMPING,
+        loss_scale=mapper.config.bundle_adjustment.loss_scale,
+        sigma_px=sigma_px,
+        threads=mapper.config.threads,
+    )
+
+
+def free_units_of(mapper: Mapper, absolute: AbsolutePriors) -> Bools:
+    """All registered units; where nothing else holds the frame, the first one does."""
+    free = mapper.registered.copy()
+    if not (absolute.hold_the_frame and mapper.config.bundle_adjustment.priors):
+        free[np.flatnonzero(free)[0]] = False
+    return free
+
+
+def terms_of(mapper: Mapper, result: Refinement) -> list[Term]:
+    """Priors of everything that varies, and of where the scene lies."""
+    terms: list[Term] = []
+    if not mapper.config.bundle_adjustment.priors:
+        return terms
+    if result.calibration.free:
+        terms.append(calibration_prior(mapper, result.held))
+        terms += [] if result.given_scale is None else [result.given_scale]
+    elif result.recalibrated.any():
+        # The cameras that stay hold the gauge.
+        of_others = (~result.recalibrated).astype(np.float64)
+        terms.append(replace(calibration_prior(mapper, result.held), gauge_weights=of_others))
+    if result.is_of_one_camera:
+        terms.append(calibration_prior(mapper, np.ones((1, 6), dtype=np.bool_)))
+    if result.intrinsics_vary:
+        terms.append(intrinsics_prior(mapper))
+    if result.times_vary:
+        terms.append(time_prior(mapper, mean_varies=result.mean_time_varies, held=result.held_times))
+    return terms + result.absolute.terms(mapper)
+
+
+def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
+    """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
+
+    None where they would not be those of what was adjusted, and where there is too much for an inverse.
+    """
+    if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
+        return None
+    several = not mapper.drive.has_single_camera
+    is_kept = result.calibration.free or result.is_of_one_camera
+    terms = [term for term in terms_of(mapper, result) if is_kept or not isinstance(term, CalibrationPrior)]
+    if several and not result.calibration.free:
+        terms.append(calibration_prior(mapper))
+    free_intrinsics = None
+    if result.intrinsics is not None and result.intrinsics.asked:
+        # Whoever lets the focal length vary is not certain of the others either.
+        free_intrinsics = np.ones((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_)
+        if not result.intrinsics_vary:
+            terms.append(intrinsics_prior(mapper))
+    times_vary = several and times_may_vary(mapper)
+    if times_vary:
+        terms += [] if result.times_vary else [time_prior(mapper, mean_varies=False)]
+        terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
+    problem, _ = mapper.problem(
+        free_units_of(mapper, result.absolute),
+        free_cameras=np.full(len(mapper.camera_kind), several or result.is_of_one_camera),
+        free_intrinsics=free_intrinsics,
+        free_times=np.full(len(mapper.camera_kind), times_vary),
+        free_readouts=undeclared_readouts(mapper) & times_vary,
+        terms=terms,
+        options=solver_options(mapper, result.sigma_px),
+    )
+    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+        return None
+    return _with_lens_errors(result, of_cameras_alone(mapper, covariances(problem, problem.state)))
+
+
+def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Covariances | None:
+    """The certainty with what lens models and given rotations leave open of the scale, where positions do not tell."""
+    if certainty is None or result.given_scale is None:
+        return certainty
+    return replace(certainty, sigma_scale=float(np.hypot(certainty.sigma_scale, result.given_scale.sigma_scale)))
