@@ -18,6 +18,7 @@ from types import FunctionType, ModuleType
 from typing import Any
 from uuid import uuid4
 
+import numba
 from numba import njit
 from numba.core import caching
 
@@ -113,6 +114,19 @@ class _OfAllSources:
         return found
 
 
+class _IndexOfSources(caching.IndexDataCacheFile):  # type: ignore[misc]
+    """Index of a kernel's compiled forms, which is not read for other sources.
+
+    Signatures in it name tuples of the package: one that an update has renamed cannot be read any more. numba does not
+    read on where an index begins with another version.
+    """
+
+    def __init__(self, cache_path: str, filename_base: str, source_stamp: object) -> None:
+        super().__init__(cache_path, filename_base, source_stamp)
+        if isinstance(source_stamp, str):  # one of `_OfAllSources`
+            self._version = f"{numba.__version__} {source_stamp}"
+
+
 class _InGivenFolder(_OfAllSources, caching.UserProvidedCacheLocator):  # type: ignore[misc]
     """In NUMBA_CACHE_DIR."""
 
@@ -128,3 +142,4 @@ class _InUsersFolder(_OfAllSources, caching.UserWideCacheLocator):  # type: igno
 # numba asks its locators in this order. To add some is documented by a variable of the environment alone, which would
 # be there for all programs that this one starts.
 caching.CacheImpl._locator_classes[:0] = [_InGivenFolder, _BesideSources, _InUsersFolder]
+caching.IndexDataCacheFile = _IndexOfSources

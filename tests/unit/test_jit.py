@@ -22,8 +22,8 @@ from mrasfm_engine.jit import njit
 from mrasfm_engine.other import of_python
 
 @njit(cache=True)
-def result(x):
-    return times(x) + SHIFT
+def result(pair):
+    return times(pair.other) + SHIFT
 """
 INNER = """
 from mrasfm_engine.jit import njit
@@ -39,6 +39,9 @@ from typing import NamedTuple
 class Pair(NamedTuple):
     factor: int
     other: int
+
+def made(other):
+    return Pair(0, other)
 """
 CHANGED = """
 import pathlib
@@ -46,7 +49,11 @@ constants = pathlib.Path("mrasfm_engine/constants.py")
 import mrasfm_engine.constants, mrasfm_engine.jit
 constants.write_text("SHIFT = 5")
 """
-RUN = "from mrasfm_engine.outer import result; print(result(10), sum(result.stats.cache_hits.values()))"
+RUN = """
+from mrasfm_engine.outer import result
+from mrasfm_engine.pair import made
+print(result(made(10)), sum(result.stats.cache_hits.values()))
+"""
 
 
 def test_sources_are_those_of_kernels_and_constants() -> None:
@@ -67,8 +74,10 @@ def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path
     shutil.copy(jit.__file__, package / "jit.py")
     (package / "outer.py").write_text(OUTER)
 
-    def run(factor: int, shift: int, other: str = "", pair: str = PAIR, first: str = "") -> list[int]:
-        (package / "inner.py").write_text(INNER.replace("FACTOR", str(factor)))
+    def run(
+        factor: int, shift: int, other: str = "", pair: str = PAIR, inner: str = INNER, first: str = ""
+    ) -> list[int]:
+        (package / "inner.py").write_text(inner.replace("FACTOR", str(factor)))
         (package / "constants.py").write_text(f"SHIFT = {shift}")
         (package / "pair.py").write_text(pair)
         (package / "other.py").write_text(f"def of_python(): {other or 'pass'}")
@@ -89,4 +98,8 @@ def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path
     assert run(3, 2, pair=PAIR + "# changed") == [32, 0]
     assert run(3, 4, first=CHANGED) == [34, 0], "as it was imported, not as it is by now"
     assert run(3, 5) == [35, 0], "nobody else takes that"
+    renamed = PAIR.replace("class Pair", "class Two").replace("return Pair", "return Two")
+    inner = INNER.replace("Pair", "Two")
+    assert run(3, 5, pair=renamed, inner=inner) == [35, 0], "what is kept names a tuple that is not there any more"
+    assert run(3, 5, pair=renamed, inner=inner) == [35, 1]
     assert any((tmp_path / "kept" if given_folder else package).rglob("*.nbi"))
