@@ -28,7 +28,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     Views,
     linearise,
 )
-from mrasfm_engine.bundle_adjustment.schur_structure import MAX_BLOCKS, Groups
+from mrasfm_engine.bundle_adjustment.schur_structure import Groups
 from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Floats, Ints
 
@@ -69,6 +69,15 @@ class Sums(NamedTuple):
 def image_sums_gradient(inner: int) -> int:
     """Place of the gradient of a camera's `inner` unknowns among an image's sums."""
     return UNIT_SUMS + 6 * inner + inner * (inner + 1) // 2
+
+
+@njit(cache=True, forceinline=True, error_model="numpy")
+def _most_blocks(first_block: Any) -> int:
+    """Largest number of blocks that a group couples."""
+    most = 0
+    for i in range(len(first_block) - 1):
+        most = max(most, first_block[i + 1] - first_block[i])
+    return most
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -120,9 +129,10 @@ def accumulate(
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     jx, jc = np.empty((2, 3)), np.empty((2, dof))
     v, inv, e = np.empty(6), np.empty(6), np.empty(3)
-    w = np.empty((MAX_BLOCKS, 3, dof))  # coupling of a point to its blocks, transposed
+    most = _most_blocks(first_block)
+    w = np.empty((most, 3, dof))  # coupling of a point to its blocks, transposed
     # W_j and W_i V^-1, spread over blocks' entries
-    tiled, repeated = np.empty((MAX_BLOCKS, 3 * 6 * dof)), np.empty(3 * 6 * dof)
+    tiled, repeated = np.empty((most, 3 * 6 * dof)), np.empty(3 * 6 * dof)
     group = np.searchsorted(first_point, lo, side="right") - 1
     for index in range(lo, hi):
         while index >= first_point[group + 1]:

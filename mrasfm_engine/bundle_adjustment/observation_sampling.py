@@ -19,6 +19,7 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats
 
 GRID = (8, 5)  # columns and rows of cells of an image
+MOST_UNITS = 256  # that see one point: an adjustment takes all of their pairs
 
 
 def solve_with_chosen_points(
@@ -28,6 +29,7 @@ def solve_with_chosen_points(
 
     With `an_image` zero it is `solve` with all of them.
     """
+    problem = replace(problem, observations=thinned(problem.observations))
     if not an_image:
         return solve(problem, cancel=cancel)
     chosen = choose_points(problem.observations, problem.layout.unit_slot >= 0, image_size_px, an_image=an_image)
@@ -35,6 +37,33 @@ def solve_with_chosen_points(
     points_m = problem.state.points_m.copy()
     points_m[chosen] = solution.points_m
     return problem.with_points_refined(replace(solution, points_m=points_m)), report
+
+
+def thinned(observations: Observations) -> Observations:
+    """The observations with at most `MOST_UNITS` units of each point, evenly spread over all that see it.
+
+    What is left out is not known to the adjustment: poses get less certain, never more. Taken for a point that is known
+    already, it would tie them to it.
+    """
+    o = observations
+    keep = np.ones(len(o.unit), dtype=np.bool_)
+    for p in np.flatnonzero(np.diff(o.first_of_point) > MOST_UNITS).tolist():
+        rows = slice(o.first_of_point[p], o.first_of_point[p + 1])
+        units = np.unique(o.unit[rows])
+        if len(units) > MOST_UNITS:
+            spread = np.linspace(0, len(units) - 1, MOST_UNITS).round().astype(np.int64)
+            keep[rows] = np.isin(o.unit[rows], units[spread])
+    if keep.all():
+        return o
+    return Observations(
+        unit=o.unit[keep],
+        camera=o.camera[keep],
+        point=o.point[keep],
+        xy_px=o.xy_px[keep],
+        num_points=o.num_points,
+        band=None if o.band is None else o.band[keep],
+        fixed=o.fixed,
+    )
 
 
 def choose_points(observations: Observations, free_units: Bools, image_size_px: Floats, *, an_image: int) -> Bools:

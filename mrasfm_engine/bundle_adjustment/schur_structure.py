@@ -17,8 +17,6 @@ from mrasfm_engine.bundle_adjustment.problem import Layout, Observations, RowBan
 from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Ints
 
-MAX_BLOCKS = 128  # free units and cameras one point may couple; more observations of it still count for themselves
-
 
 class Groups(NamedTuple):
     """Groups of points that couple the same blocks, see `SchurStructure`."""
@@ -112,11 +110,11 @@ def _images(o: Observations, layout: Layout) -> tuple[Ints, Ints, Ints, Ints]:
 
 @njit(cache=True, forceinline=True, error_model="numpy")
 def _insert(out: Any, begin: int, end: int, block: int) -> int:
-    """Put a block into the ascending list out[begin:end], unless it is there or the list is full; the new end."""
+    """Put a block into the ascending list out[begin:end], unless it is there; the new end."""
     at = end
     while at > begin and out[at - 1] > block:
         at -= 1
-    if (at > begin and out[at - 1] == block) or end - begin >= MAX_BLOCKS:
+    if at > begin and out[at - 1] == block:
         return end
     for i in range(end, at, -1):
         out[i] = out[i - 1]
@@ -139,10 +137,6 @@ def _blocks_of_points(
         begin = end
         last = first[p] if fixed[p] else first[p + 1]
         for n in range(first[p], last):
-            # Cameras of the last slots come last: a full list keeps its cameras if these are put in first.
-            if camera_slot[obs_camera[n]] >= 0:
-                end = _insert(out, begin, end, num_units + camera_slot[obs_camera[n]])
-        for n in range(first[p], last):
             if weight is None:
                 if unit_slot[obs_unit[n]] >= 0:
                     end = _insert(out, begin, end, unit_slot[obs_unit[n]])
@@ -151,6 +145,9 @@ def _blocks_of_points(
                 for a in range(3):
                     if weight[band, a] != 0.0 and unit_slot[support[band, a]] >= 0:
                         end = _insert(out, begin, end, unit_slot[support[band, a]])
+        for n in range(first[p], last):
+            if camera_slot[obs_camera[n]] >= 0:
+                end = _insert(out, begin, end, num_units + camera_slot[obs_camera[n]])
         starts[p + 1] = end
         code = np.uint64(14695981039346656037)
         for i in range(begin, end):

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.bundle_adjustment.observation_sampling import thinned
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
@@ -369,13 +370,15 @@ class Mapper:
         problem = Problem(
             state=replace(self.state, points_m=self.state.points_m.take(tracks, axis=0)),
             camera_kind=self.camera_kind,
-            observations=Observations(
-                unit=self.keypoints.unit.take(rows),
-                camera=self.keypoints.camera.take(rows),
-                point=point,
-                xy_px=self.keypoints.xy_px.take(rows, axis=0),
-                num_points=len(tracks),
-                band=None if self.state.simultaneous else self.keypoints.band[rows],
+            observations=thinned(
+                Observations(
+                    unit=self.keypoints.unit.take(rows),
+                    camera=self.keypoints.camera.take(rows),
+                    point=point,
+                    xy_px=self.keypoints.xy_px.take(rows, axis=0),
+                    num_points=len(tracks),
+                    band=None if self.state.simultaneous else self.keypoints.band[rows],
+                )
             ),
             layout=Layout.from_free(
                 free_units & self.registered,

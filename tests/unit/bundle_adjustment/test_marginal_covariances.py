@@ -8,10 +8,19 @@ import pytest
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.scene.state import State
-from tests.helpers.small_problems import Case, dense_normal_equations, focal_prior, make_case, perturbed, with_focal
+from tests.helpers.small_problems import (
+    Case,
+    dense_normal_equations,
+    focal_prior,
+    make_case,
+    perturbed,
+    project,
+    with_focal,
+)
 
 
 def prior_of(state: State, *, rotation_deg: float = 0.5, translation_m: float = 0.01) -> CalibrationPrior:
@@ -35,6 +44,29 @@ def stereo(seed: int, *, units: int = 5, points: int = 200) -> Case:
         seed=seed,
         options=SolverOptions(sigma_px=0.5),
     )
+
+
+def test_points_that_very_many_units_see_are_not_taken_for_known() -> None:
+    """Every pair of the units that see a point is coupled: one that were not would be tied to a known point."""
+    units, points = 150, 12
+    case = make_case(units=units, cameras=1, points=points, options=SolverOptions(sigma_px=0.5))
+    truth = case.truth
+    ahead_m = truth.unit_position_m[-1] - truth.unit_position_m[0]
+    beside = np.random.default_rng(0).normal(size=(points, 3)) * 0.2 * np.linalg.norm(ahead_m)
+    truth = replace(truth, points_m=truth.unit_position_m[-1] + ahead_m + beside)
+    unit, point = np.tile(np.arange(units), points), np.repeat(np.arange(points), units)
+    camera = np.zeros_like(unit)
+    pixels = project(truth, case.problem.camera_kind, unit, camera, point)
+    problem = replace(
+        case.problem,
+        state=truth,
+        observations=Observations(unit=unit, camera=camera, point=point, xy_px=pixels, num_points=points),
+        layout=Layout.from_free(~np.isin(np.arange(units), [0, units - 1]), np.zeros(1, dtype=np.bool_)),
+    )
+    found = covariances(problem, truth, shared_errors=False).sigma_unit_position_m[1:-1]
+    h, _ = dense_normal_equations(problem, truth)
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(h)))[: 6 * (units - 2)].reshape(-1, 6)[:, 3:]
+    np.testing.assert_allclose(found, sigma, rtol=1e-3)
 
 
 @pytest.mark.parametrize("free_focal", [False, True])

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.observation_sampling import GRID, choose_points, solve_with_chosen_points
+from mrasfm_engine.bundle_adjustment.observation_sampling import (
+    GRID,
+    MOST_UNITS,
+    choose_points,
+    solve_with_chosen_points,
+    thinned,
+)
 from mrasfm_engine.bundle_adjustment.problem import Observations
 from mrasfm_engine.bundle_adjustment.solver import solve
 from tests.helpers.small_problems import Case, make_case, perturbed, position_errors_m
@@ -88,3 +94,17 @@ def test_without_a_choice_it_is_the_solver(an_image: int) -> None:
     assert report.iterations == expected_report.iterations
     np.testing.assert_allclose(ours.unit_position_m, expected.unit_position_m, atol=1e-12)
     assert problem.cost(ours) == pytest.approx(problem.cost(expected), rel=1e-6)
+
+
+def test_of_a_point_that_very_many_units_see_some_are_taken_all_along() -> None:
+    many = 3 * MOST_UNITS
+    unit = np.concatenate([np.repeat(np.arange(many), 2), np.arange(MOST_UNITS), np.repeat(np.arange(10), 60)])
+    point = np.repeat([0, 1, 2], [2 * many, MOST_UNITS, 600])
+    o = Observations(unit=unit, camera=np.zeros_like(unit), point=point, xy_px=np.zeros((len(unit), 2)), num_points=3)
+    found = thinned(o)
+    np.testing.assert_array_equal(np.diff(found.first_of_point), [2 * MOST_UNITS, MOST_UNITS, 600])
+    taken = np.unique(found.unit[: found.first_of_point[1]])
+    assert len(taken) == MOST_UNITS
+    assert (taken[0], taken[-1]) == (0, many - 1)
+    assert np.diff(taken).max() <= 4
+    assert thinned(found) is found
