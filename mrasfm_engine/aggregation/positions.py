@@ -44,8 +44,12 @@ def drive_positions(
     if known.gnss is not None and known.antenna_in_rig_m is not None and known.georeference is not None:
         # The prior's frame is the scene's: both have their origin in the middle of the track.
         scene_from_track = se3.inverse(scene.ecef_from_local) @ known.georeference.ecef_from_local
-        measured, sigma = known.gnss.at(scene.drive.timestamps_us, max_gap_us=round(config.max_time_gap_s * 1e6))
         lever = np.asarray(known.antenna_in_rig_m)
+        measured, sigma = known.gnss.at(
+            scene.drive.timestamps_us,
+            max_gap_us=round(config.max_time_gap_s * 1e6),
+            way_m=se3.apply(se3.inverse(scene_from_track), _antenna_m(scene, lever)),
+        )
         measured = se3.apply(map_from_scene @ scene_from_track, measured)
         step_s = float(np.median(np.diff(scene.drive.timestamps_us))) / 1e6 if len(measured) > 1 else np.inf
         correlated = max(1.0, config.correlation_time_s / max(step_s, 1e-6))
@@ -67,6 +71,13 @@ def drive_positions(
         lever_arm_m=lever,
     )
     return DrivePositions(measured=prior, prior=prior, bias_m=np.zeros(3), up=map_from_scene[:3, 2])
+
+
+def _antenna_m(scene: SourceScene, lever_arm_m: Floats) -> Floats:
+    """Places (u, 3) of the antenna in the scene's frame, NaN at units that are not registered."""
+    result: Floats = se3.apply(scene.world_from_rig, lever_arm_m[None])[:, 0]
+    result[~scene.unit_registered] = np.nan
+    return result
 
 
 def with_bias(positions: DrivePositions, state: State) -> DrivePositions:

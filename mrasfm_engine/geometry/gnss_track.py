@@ -7,11 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.neighbours import nearest_sorted
 from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_BEYOND_S = 0.5  # before the first and after the last sample nothing is known
 NEIGHBOURS = 5  # samples on each side that a sample is compared with
-NEIGHBOUR_SPAN_S = 3.0
+MIN_NEIGHBOURS, ENOUGH_NEIGHBOURS = 4, 6  # of both sides, so that one that is wrong itself does little
+USUAL_SPAN_S, NEIGHBOUR_SPAN_S = 0.5, 3.0  # on each side: where that holds enough of them, and at most
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
 HARDEST_MPS2 = 10.0  # a vehicle accelerates and brakes by less
 BRAKING_S, HELD_SIGMAS = 1.0, 3.0  # before a receiver's last positions, which are all the same
@@ -38,43 +40,95 @@ class GnssTrack:
     # (n,) repetitions of the position before, which are not good either; empty where they are not known
     held: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
-    def at(self, timestamps_us: Ints, *, max_gap_us: int) -> tuple[Floats, Floats]:
-        """Positions and sigmas (m, 3) at other times, linear between good samples; NaN outside and in larger gaps."""
+    def at(self, timestamps_us: Ints, *, max_gap_us: int, way_m: Floats | None = None) -> tuple[Floats, Floats]:
+        """Positions and sigmas (m, 3) at other times, between good samples; NaN outside and in larger gaps.
+
+        Between two samples they follow the antenna's way, where it is known: they are off it by as much as the samples
+        are. Elsewhere they are linear, and a bend that neighbouring samples show makes them less certain.
+
+        Parameters
+        ----------
+        timestamps_us
+            (m,) ascending.
+        way_m
+            (m, 3) where the antenna was at these times, in axes of the local frame, NaN where that is not known.
+        """
         t, p, s = self.timestamps_us[self.good], self.position_m[self.good], self.sigma_m[self.good]
         position, sigma = np.full((len(timestamps_us), 3), np.nan), np.full((len(timestamps_us), 3), np.nan)
-        if not len(t):
+        if len(t) < 2:
+            same = np.isin(timestamps_us, t)
+            position[same], sigma[same] = p[:1], s[:1]
             return position, sigma
-        after = np.clip(np.searchsorted(t, timestamps_us), 1, max(len(t) - 1, 1)) if len(t) > 1 else None
-        if after is None:
-            same = timestamps_us == t[0]
-            position[same], sigma[same] = p[0], s[0]
-            return position, sigma
+        after = np.clip(np.searchsorted(t, timestamps_us), 1, len(t) - 1)
         gap = t[after] - t[after - 1]
         fraction = (timestamps_us - t[after - 1]) / gap
         inside = (fraction >= 0) & (fraction <= 1) & ((gap <= max_gap_us) | (fraction == 0) | (fraction == 1))
-        blend = p[after - 1] + fraction[:, None] * (p[after] - p[after - 1])
+        share = fraction[:, None]
+        blend = p[after - 1] + share * (p[after] - p[after - 1])
+        bend_m = 4.0 * fraction * (1.0 - fraction) * _bends_m(t / 1e6, p)[after - 1]
+        if way_m is not None:
+            before_m, after_m = (_place_at(t[k], timestamps_us, way_m, gap) for k in (after - 1, after))
+            follows_m = way_m - before_m - share * (after_m - before_m)
+            known = np.isfinite(follows_m[:, 0])
+            blend[known] += follows_m[known]
+            bend_m[known] = 0.0
         position[inside] = blend[inside]
-        sigma[inside] = np.maximum(s[after - 1], s[after])[inside]
+        sigma[inside] = np.hypot(np.maximum(s[after - 1], s[after]), bend_m[:, None])[inside]
         return position, sigma
+
+
+def _bends_m(time_s: Floats, position_m: Floats) -> Floats:
+    """Distance (n - 1,) of the middle of every chord between samples from a way that bends as its neighbours show."""
+    step_s, bend_mps2 = np.diff(time_s), np.zeros(len(time_s))
+    velocity = np.diff(position_m, axis=0) / step_s[:, None]
+    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
+    bend_mps2[1:-1] = 2.0 * change / (step_s[1:] + step_s[:-1])
+    result: Floats = np.maximum(bend_mps2[1:], bend_mps2[:-1]) * step_s**2 / 8.0
+    return result
+
+
+def _place_at(time_us: Ints, known_us: Ints, way_m: Floats, gap_us: Ints) -> Floats:
+    """A way (k, 3) at some times (m,); NaN where those at which it is known are as far apart as `gap_us` (m,)."""
+    known = np.isfinite(way_m[:, 0])
+    result = np.full((len(time_us), 3), np.nan)
+    if known.sum() < 2:
+        return result
+    at_us = known_us[known]
+    after = np.clip(np.searchsorted(at_us, time_us), 1, len(at_us) - 1)
+    inside = (time_us >= at_us[0]) & (time_us <= at_us[-1])
+    # An end of a chord that is one of these times itself needs no other near it.
+    fine = inside & ((at_us[after] - at_us[after - 1] < gap_us) | np.isin(time_us, at_us))
+    for axis in range(3):
+        result[fine, axis] = np.interp(time_us[fine], at_us, way_m[known, axis])
+    return result
 
 
 def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, *, outlier_sigmas: float) -> Bools:
     """Mask (n,) of samples far from the line through their neighbours in time.
 
-    The line is fitted with L1 weights, so that single neighbours that are wrong themselves do little.
+    The line is fitted with L1 weights, so that single neighbours that are wrong themselves do little. It may be as far
+    off as a vehicle gets from a straight line that accelerates as hard as it can meanwhile: of a receiver with few
+    samples a second only large errors show here, and the scene shows the others.
     """
     n = len(timestamps_us)
     bad = np.zeros(n, dtype=np.bool_)
     t = timestamps_us / 1e6
     for i in range(n):
-        lo, hi = max(0, i - NEIGHBOURS), min(n, i + NEIGHBOURS + 1)
-        near = np.array([k for k in range(lo, hi) if k != i and abs(t[k] - t[i]) <= NEIGHBOUR_SPAN_S], dtype=np.int64)
-        if len(near) < 4:
+        dt = t[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1] - t[i]
+        near = np.flatnonzero((np.abs(dt) <= _span_s(dt)) & (np.arange(len(dt)) != min(i, NEIGHBOURS)))
+        if len(near) < MIN_NEIGHBOURS:
             continue
-        predicted = _line_at(t[near] - t[i], position_m[near])
-        off = np.linalg.norm((position_m[i] - predicted) / sigma_m[i])
-        bad[i] = off > outlier_sigmas and np.linalg.norm(position_m[i] - predicted) > MIN_JUMP_M
+        off_m = position_m[i] - _line_at(dt[near], position_m[near + max(0, i - NEIGHBOURS)])
+        bend_m = 0.5 * HARDEST_MPS2 * float((dt[near] ** 2).mean())
+        far = np.linalg.norm(off_m / sigma_m[i]) > outlier_sigmas
+        bad[i] = far and np.linalg.norm(off_m) > max(MIN_JUMP_M, bend_m)
     return bad
+
+
+def _span_s(dt: Floats) -> float:
+    """Half width of the window of neighbours by their times (n,): no wider than some need, as the way bends in it."""
+    enough = np.sort(np.abs(dt))[min(ENOUGH_NEIGHBOURS, len(dt) - 1)]
+    return float(np.clip(enough, USUAL_SPAN_S, NEIGHBOUR_SPAN_S))
 
 
 def find_held(timestamps_us: Ints, position_m: Floats, sigma_m: Floats) -> Bools:
@@ -146,11 +200,11 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
     position, heading = np.empty((len(times), 3)), np.full(len(times), np.nan)
     sigma = np.full((len(times), 6), ATTITUDE_SIGMA_RAD)
     sigma[:, 2] = np.pi
+    sigma[:, 3:] = track.sigma_m[track.good][nearest_sorted(t, times)]
     for i, now in enumerate(times):
-        sigma[i, 3:] = track.sigma_m[track.good][np.abs(t - now).argmin()]
         for half in HEADING_WINDOWS_S:
-            near = np.flatnonzero(np.abs(t - now) <= half)
-            if len(near) < 3:
+            near = slice(*np.searchsorted(t, [now - half, np.nextafter(now + half, np.inf)]))
+            if near.stop - near.start < 3:
                 continue
             centre, velocity, left_m = _fit_motion(t[near] - now, p[near])
             position[i] = centre
@@ -169,8 +223,7 @@ def rough_trajectory(track: GnssTrack, timestamps_us: Ints, antenna_in_rig_m: Fl
     known = np.flatnonzero(np.isfinite(heading))
     if not len(known):
         return None
-    nearest = known[np.abs(times[:, None] - times[None, known]).argmin(1)]
-    heading = heading[nearest]
+    heading = heading[known[nearest_sorted(times[known], times)]]
     rotation = se3.exp_so3(np.stack([np.zeros_like(heading), np.zeros_like(heading), heading], -1))
     poses = se3.transform(rotation, position - rotation @ antenna_in_rig_m)
     beyond = np.abs(times - timestamps_us / 1e6) > MAX_BEYOND_S

@@ -1,4 +1,4 @@
-"""Nearest places in the plane."""
+"""Nearest places in the plane, and nearest values on a line."""
 
 from __future__ import annotations
 
@@ -20,3 +20,12 @@ def nearest(
     distance = np.asarray(found[0], dtype=np.float64).reshape(len(xy_m), count)
     index = np.asarray(found[1], dtype=np.int64).reshape(len(xy_m), count)
     return distance, np.where(np.isfinite(distance), index, 0)
+
+
+def nearest_sorted(values: Ints | Floats, wanted: Ints | Floats) -> Ints:
+    """Indices (m,) of the values (n,), ascending and at least one, that are nearest to `wanted` (m,)."""
+    after = np.clip(np.searchsorted(values, wanted), 1, max(len(values) - 1, 1))
+    before = after - 1
+    after = np.minimum(after, len(values) - 1)
+    result: Ints = np.where(np.abs(wanted - values[before]) <= np.abs(values[after] - wanted), before, after)
+    return result

@@ -26,6 +26,7 @@ from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, ScalePrior, 
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import FISHEYE
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
 
@@ -133,8 +134,13 @@ def _lens_sigmas(mapper: Mapper) -> Floats:
             continue
         x, y = ((mapper.keypoints.xy_px[own] - params[2:4]) / params[:2]).T
         r2 = x**2 + y**2
-        tangential = [np.hypot(2 * x * y, r2 + 2 * z**2) for z in (y, x)]
-        moved = np.array([r2**0.5, y, r2**1.5, r2**2.5, *tangential])
+        if mapper.camera_kind[c] == FISHEYE:
+            across, ahead = mapper.keypoints.rays[own, :2], mapper.keypoints.rays[own, 2]
+            theta = np.arctan2(np.linalg.norm(across, axis=1), ahead)
+            distortion = [theta**3, theta**5, theta**7, theta**9]
+        else:
+            distortion = [r2**1.5, r2**2.5, *(np.hypot(2 * x * y, r2 + 2 * z**2) for z in (y, x))]
+        moved = np.array([r2**0.5, y, *distortion])
         by_parameter = np.sqrt((moved**2).mean(axis=1)) * params[:2].mean()
         by_parameter = np.insert(by_parameter, 2, [1.0, 1.0])  # the principal point's two, in pixels
         result[c] = LENS_SIGMA_PX / np.maximum(by_parameter, 1e-6)

@@ -38,7 +38,7 @@ from mrasfm_engine.mapping.receiver_fit import (
 )
 from mrasfm_engine.mapping.receiver_jumps import AROUND, segment_of
 from mrasfm_engine.types import Floats, Ints
-from schemas.findings import Finding, warning
+from schemas.findings import Finding, error, warning
 
 MIN_CLOCK_OFFSET_S = 0.05
 CLOCK_OFFSET_SIGMAS = 5.0
@@ -48,6 +48,7 @@ MIN_ROUGH_POSES = 2
 KNOTS = 20  # in the correlation time of what wanders: less often than its filter lets a receiver change its mind
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 SCALE_ROUNDS = 3  # of fitting an arbitrary scale to the receiver
+FOLLOWING_ROUNDS = 2  # of placing the scene by positions that follow it between samples, as it was placed before
 # Sigma of the scale by images, relative, beyond which it does not bound their error, as the cost is no longer alike in
 # the scale and in its inverse. Of a stereo pair it is a percent or less.
 UNKNOWN_SIGMA_SCALE = 0.05
@@ -75,8 +76,7 @@ def place_by_gnss(
         Whether baselines may be wrong beyond what is known of them, by any factor: positions that have the scene's
         shape then give their scale to the scene and to the baselines, unless swapped ones would explain it.
     """
-    settings, times = mapper.config.gnss, mapper.drive.timestamps_us
-    measured, sigma = gnss.at(times, max_gap_us=round(settings.max_time_gap_s * 1e6))
+    measured, sigma = _positions_m(mapper, gnss)
     units = np.flatnonzero(mapper.registered & np.isfinite(measured[:, 0]))
     single = mapper.drive.has_single_camera
     sigma_rig_scale = float(np.hypot(scale_of_baselines(mapper)[1], sigma_scale))
@@ -101,6 +101,16 @@ def place_by_gnss(
     if isinstance(alignment, Refusal):
         return Placement(reason=alignment.reason, is_of_another_scale=alignment.is_of_scale)
     move(mapper, alignment.world_from_model)
+    for _ in range(FOLLOWING_ROUNDS):
+        begun, (measured, sigma) = (measured, sigma), _positions_m(mapper, gnss, antenna_in_rig_m)
+        if np.array_equal(measured, begun[0], equal_nan=True):
+            break  # the receiver has a position at every unit's time
+        following = align()
+        if isinstance(following, Refusal):
+            measured, sigma = begun
+            break
+        alignment = following
+        move(mapper, alignment.world_from_model)
     placement = Placement(
         alignment=alignment,
         known_m=measured,
@@ -118,6 +128,19 @@ def place_by_gnss(
         placement = replace(placement, scale_of_rig=_scale_by_positions(mapper, placement))
         placement.findings = _findings(mapper, placement)
     return placement
+
+
+def _positions_m(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats | None = None) -> tuple[Floats, Floats]:
+    """Positions and sigmas (u, 3) at the times of all units, see `GnssTrack.at`.
+
+    With the lever arm they follow the scene between samples, which then lies where the receiver says.
+    """
+    times_us, way_m = mapper.drive.timestamps_us, None
+    if antenna_in_rig_m is not None:
+        units = np.flatnonzero(mapper.registered)
+        way_m = np.full((len(times_us), 3), np.nan)
+        way_m[units] = antenna_places_m(mapper, units, antenna_in_rig_m)
+    return gnss.at(times_us, max_gap_us=round(mapper.config.gnss.max_time_gap_s * 1e6), way_m=way_m)
 
 
 def _with_receivers_scale(
@@ -148,6 +171,9 @@ def reassess_positions(
     Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas. The sizes
     of their errors are those of `receiver_errors`, or, if `thorough`, of `most_likely_errors`.
     """
+    if placement.track is not None:
+        measured, sigma = _positions_m(mapper, placement.track, placement.lever_arm_m)
+        placement = replace(placement, known_m=measured, known_sigma_m=sigma)
     units = np.flatnonzero(mapper.registered & np.isfinite(placement.known_m[:, 0]))
     off_m = antenna_places_m(mapper, units, placement.lever_arm_m) - placement.known_m[units]
     inlier, factor = assess_residuals(
@@ -336,6 +362,24 @@ def move(mapper: Mapper, world_from_model: Floats) -> None:
     state.unit_rotation[:] = world_from_model[:3, :3] @ state.unit_rotation
     state.unit_position_m[:] = se3.apply(world_from_model, state.unit_position_m)
     state.points_m[:] = se3.apply(world_from_model, state.points_m)
+
+
+def refusal_findings(placement: Placement) -> list[Finding]:
+    """The finding that the receiver's positions take no part, and why.
+
+    Where they contradict the rig's lengths alone, one of both is wrong, and the scene has the rig's: an error.
+    """
+    if placement.prior is not None or not placement.reason:
+        return []
+    what = f"positions of the receiver are not used, and the scene is not georeferenced: {placement.reason}"
+    if placement.is_of_another_scale:
+        remedy = (
+            "Check the units of rig.cameras (metres) and of gnss.samples (degrees, metres): all lengths of the scene "
+            "are those of the rig, and as wrong as it is."
+        )
+        return [error("gnss-contradicts-rig", what, remedy)]
+    remedy = "Check gnss.samples: their clock, the order of latitude and longitude, and the stated sigmas."
+    return [warning("gnss-not-used", what, remedy)]
 
 
 def jump_findings(mapper: Mapper, placement: Placement) -> list[Finding]:

@@ -155,21 +155,20 @@ def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
     """Tell white errors from wandering ones by how positions scatter about the scene from one to the next.
 
     The scatter's share of the declared variance is white, and averages out; the rest wanders. Scatter that is not
-    clearly less than declared is all of it.
+    clearly less than declared is all of it, and so is one of which nothing is seen: few positions that all wander
+    together would have the way between them exactly.
     """
     good = placement.inlier
     times_s = mapper.drive.timestamps_us[placement.units[good]] / 1e6
-    if len(times_s) < MIN_POSITIONS:
-        return ReceiverErrors(white=MIN_WHITE, wander=placement.noise_factor)
     # Positions between two samples are a blend of both.
     apart = _positions_a_sample(placement, times_s)
     sigma_m = placement.known_sigma_m[placement.units[good]] * placement.noise_factor
     whitened = placement.off_m[good] / sigma_m
     steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
-    white = float((np.median(np.abs(steps)) / 0.6745) ** 2) if len(steps) else 0.0
+    white = float((np.median(np.abs(steps)) / 0.6745) ** 2) if len(steps) else 1.0
     # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
     # share a sample, which makes n half of them.
-    if len(steps) and white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * len(steps)):
+    if white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * max(len(steps), 1)):
         white = 1.0
     return ReceiverErrors(
         white=placement.noise_factor * max(float(np.sqrt(min(white, 1.0))), MIN_WHITE),

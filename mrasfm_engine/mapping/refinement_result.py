@@ -48,7 +48,7 @@ class Refinement:
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
-    is_of_one_camera: bool = False  # whose intrinsics may vary, at its place in the rig as given
+    is_of_one_camera: bool = False  # by its images; its intrinsics may vary, at its place in the rig as given
     times_vary: bool = False
     mean_time_varies: bool = False
     times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
@@ -122,7 +122,7 @@ def terms_of(mapper: Mapper, result: Refinement) -> list[Term]:
         of_others = (~result.recalibrated).astype(np.float64)
         terms.append(replace(calibration_prior(mapper, result.held), gauge_weights=of_others))
     if result.is_of_one_camera:
-        terms.append(calibration_prior(mapper, np.ones((1, 6), dtype=np.bool_)))
+        terms.append(calibration_prior(mapper, np.ones((len(mapper.camera_kind), 6), dtype=np.bool_)))
     if result.intrinsics_vary:
         terms.append(intrinsics_prior(mapper))
     if result.times_vary:

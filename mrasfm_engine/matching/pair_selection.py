@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.geometry.frustum import view_overlap
+from mrasfm_engine.geometry.neighbours import nearest_sorted
 from mrasfm_engine.matching.image_motion import (
     NEXT_UNITS,
     Motion,
@@ -204,8 +205,8 @@ def _pairs_where_known(
 ) -> Ints:
     """Pairs by overlap among units with a prior, and by window where one of the units has none."""
     units = np.flatnonzero(known)
-    nearest = units[np.abs(np.arange(len(known))[:, None] - units[None]).argmin(1)]
-    by_overlap = pairs_from_poses(drive, world_from_rig[nearest], config, usable)
+    near = units[nearest_sorted(units, np.arange(len(known)))]
+    by_overlap = pairs_from_poses(drive, world_from_rig[near], config, usable)
     by_window = pairs_from_window(drive, config, motion_unknown(drive, config), usable=usable)
     unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     both = known[unit[by_overlap]].all(axis=1)

@@ -18,7 +18,7 @@ from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import jump_findings
+from mrasfm_engine.mapping.placement import jump_findings, refusal_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -141,7 +141,8 @@ def _refined(
     between = register_between_keyframes(mapper, max_error_px=run.config.mapping.filter_error_px)
     findings = []
     if refined.placement is not None:
-        findings += [*refined.placement.findings, *jump_findings(mapper, refined.placement)]
+        findings += refined.placement.findings
+        findings += refusal_findings(refined.placement) + jump_findings(mapper, refined.placement)
     if refined.intrinsics is not None:
         findings += refined.intrinsics.findings(mapper)
     findings += [

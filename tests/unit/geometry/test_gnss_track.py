@@ -201,3 +201,54 @@ def test_a_vehicle_that_stands_moves_off_from_where_it_stood() -> None:
     # Once a second, it is a metre away when it is seen again.
     way_m = np.array([*(8.0 * np.arange(5)), 38.0, *[40.0] * 20, 41.0, 44.0, 49.0, 56.0])
     assert held_of(np.stack([way_m, 0 * way_m, 0 * way_m], axis=1), sigma_m=0.02, step_s=1.0) == []
+
+
+def hard_way(t_us: np.ndarray) -> np.ndarray:
+    """Positions of a car that brakes from 14 to 6 m/s within 2 s, and turns by 90 degrees on a radius of 12 m."""
+    t = np.arange(0.0, (t_us[-1] - t_us[0]) / 1e6 + 0.011, 0.01)
+    travelled = np.cumsum(0.01 * np.interp(t, [4.0, 6.0], [14.0, 6.0]))
+    heading = np.clip((travelled - travelled[900]) / 12.0, 0.0, np.pi / 2)
+    xy = np.cumsum(np.diff(travelled, prepend=0.0)[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1), axis=0)
+    place = np.clip(np.round((t_us - t_us[0]) / 1e4).astype(int), 0, len(t) - 1)
+    return np.concatenate([xy[place], np.zeros((len(t_us), 1))], axis=1)
+
+
+@pytest.mark.parametrize("rate_hz", [1, 2, 5, 10])
+@pytest.mark.parametrize("seed", range(3))
+def test_hard_braking_and_turns_are_no_gross_errors_at_any_rate(rate_hz: int, seed: int) -> None:
+    t = times_us(20 * rate_hz, 1.0 / rate_hz)
+    rng, sigma = np.random.default_rng(seed), np.full((len(t), 3), 0.3)
+    position = hard_way(t) + rng.normal(size=(len(t), 3)) * sigma
+    assert not find_gross_errors(t, position, sigma, outlier_sigmas=4.0).any()
+    position[len(t) // 2] += [30.0, -40.0, 0.0]
+    found = np.flatnonzero(find_gross_errors(t, position, sigma, outlier_sigmas=4.0))
+    assert len(t) // 2 in found
+    assert len(found) <= 2
+
+
+def test_between_samples_positions_follow_the_way_and_elsewhere_a_bend_makes_them_uncertain() -> None:
+    every = times_us(180)
+    way = hard_way(every)
+    off_m = np.array([3.0, 4.0, 5.0])
+    gnss = track(every[::10], way[::10] + off_m, sigma_m=0.02)
+    on_chords, sigma = gnss.at(every, max_gap_us=2_000_000)
+    inside = np.isfinite(on_chords[:, 0])
+    assert inside.sum() == 171
+    cut_m = np.linalg.norm(on_chords[inside] - way[inside] - off_m, axis=1)
+    assert cut_m.max() > 0.3
+    assert (cut_m <= 0.02 + np.linalg.norm(sigma[inside], axis=1)).all()
+    unknown = np.where((np.arange(180) < 7)[:, None], np.nan, way)
+    following, sigma = gnss.at(every, max_gap_us=2_000_000, way_m=unknown)
+    np.testing.assert_allclose(following[10:171], way[10:171] + off_m, atol=1e-9)
+    np.testing.assert_allclose(sigma[10:171], 0.02)
+    np.testing.assert_array_equal(following[:10], on_chords[:10])  # the first sample is before all that is known
+
+
+def test_a_way_with_gaps_as_long_as_those_of_the_receiver_is_not_followed() -> None:
+    every = times_us(41)
+    way, _ = bend(every)
+    gnss = track(every[::10], way[::10])
+    seldom = np.where((np.arange(41) % 15 == 0)[:, None], way, np.nan)
+    np.testing.assert_array_equal(
+        gnss.at(every, max_gap_us=10**7, way_m=seldom)[0], gnss.at(every, max_gap_us=10**7)[0]
+    )

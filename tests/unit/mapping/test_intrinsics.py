@@ -129,6 +129,21 @@ def test_a_single_camera_by_default(refine_focal: bool | None, focal: float) -> 
     assert mapper.triangulated.sum() >= count  # what is triangulated anew is seen through the lens that was found
 
 
+def test_other_cameras_of_the_rig_that_have_no_images_stay_as_given() -> None:
+    simulated = make_simulated_drive(units=12, cameras=1, points=600)
+    (camera,) = simulated.drive.manifest.rig.cameras
+    idle = camera.model_copy(update={"name": "idle"})
+    mapper = make_model(with_cameras(simulated, [camera, idle]), config=EngineConfig(threads=1))
+    state, truth = mapper.state, simulated.world_from_rig
+    state.unit_rotation[:], state.unit_position_m[:] = truth[:, :3, :3], truth[:, :3, 3]
+    mapper.registered[:] = True
+    mapper.complete()
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    assert result.georeferenced
+    np.testing.assert_allclose(mapper.state.rig_from_cam, mapper.drive.rig_from_cam, atol=1e-5)
+    assert np.linalg.norm(mapper.state.unit_position_m - truth[:, :3, 3], axis=1).max() < 0.1
+
+
 def test_a_single_camera_on_a_straight_street_says_nothing_and_is_not_certain() -> None:
     mapper, simulated = model(straight=True, focal=1.001, cameras=1)
     mapper.config = EngineConfig(threads=1)

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,7 +13,7 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import place_by_gnss
+from mrasfm_engine.mapping.placement import place_by_gnss, refusal_findings
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors, most_likely_errors, receiver_errors
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
@@ -202,6 +202,17 @@ def test_a_scale_that_images_do_not_tell_is_the_receivers(factor: float) -> None
     assert 0.0 < np.median(off_m) < 0.05
 
 
+@pytest.mark.parametrize("factor", [1.5, 3.0])
+def test_a_receiver_that_contradicts_the_rigs_lengths_is_an_error_that_is_said(factor: float) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    scale_scene(mapper, factor)
+    refused = place_by_gnss(mapper, received(simulated, 0.02), ARM_M)
+    (said,) = refusal_findings(refused)
+    assert (said.severity, said.code) == ("error", "gnss-contradicts-rig")
+    assert f"{1 / factor:.3g} times as long" in said.what
+
+
 def test_a_receiver_of_another_route_changes_nothing() -> None:
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
     mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
@@ -209,5 +220,31 @@ def test_a_receiver_of_another_route_changes_nothing() -> None:
     elsewhere_m = np.random.default_rng(2).normal(size=(UNITS, 3)) * 20.0
     placement = place_by_gnss(mapper, received(simulated, 0.02, elsewhere_m), ARM_M, sigma_scale=0.2)
     assert placement.prior is None
+    assert [(f.severity, f.code) for f in refusal_findings(placement)] == [("warning", "gnss-not-used")]
     assert placement.reason
     np.testing.assert_allclose(mapper.state.unit_position_m, before, atol=1e-9)
+
+
+@pytest.mark.parametrize("start", [0, 3])
+def test_between_the_samples_of_a_slow_receiver_positions_follow_the_scene(start: int) -> None:
+    """Chords between its samples cut bends: at the units between them its positions would be off by what they cut."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600, travelled_m=4.0 * np.arange(UNITS))
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    gnss, antenna = received(simulated, 0.001), received(simulated, 0.0).position_m
+    slow_one = replace(gnss, good=np.arange(UNITS) % 5 == start)
+    chords = slow_one.at(simulated.drive.timestamps_us, max_gap_us=2_000_000)[0]
+    known = np.isfinite(chords[:, 0])
+    assert np.linalg.norm(chords - antenna, axis=1)[known].max() > 0.1
+    placement = place_by_gnss(mapper, slow_one, ARM_M)
+    assert placement.prior is not None
+    off_m = np.linalg.norm(placement.known_m - antenna, axis=1)
+    assert np.nanmax(off_m) < 0.01
+    assert placement.noise_factor < 2.0
+
+
+def test_errors_of_which_no_scatter_is_seen_scatter() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    seldom = replace(received(simulated, 0.1), good=np.isin(np.arange(UNITS), [0, UNITS - 1]))
+    found = receiver_errors(mapper, place_by_gnss(mapper, seldom, ARM_M))
+    assert (found.wander, found.white >= 1.0) == (0.0, True)
