@@ -7,16 +7,18 @@ import tarfile
 import zipfile
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import Page, Request, expect
 
 from tests.console.conftest import Open, World, go, log_in
 from tests.helpers.live_api import Client
 from tests.helpers.slow import slow
-from tests.helpers.tiny_drive import TinyDrive, tiny_drive
+from tests.helpers.tiny_drive import TinyDrive, manifest, png, tiny_drive
 
 PIECE_BYTES = 8 << 20
+LONG_FRAMES = 2600  # of two cameras: more files than a list on a page has entries
 
 
 def folder_of(drive: TinyDrive, folder: Path) -> Path:
@@ -32,8 +34,9 @@ def upload(page: Page, url: str, what: Path) -> list[str]:
     page.on("request", lambda request: sent.append(request.url) if request.method == "PUT" else None)
     go(page, url, "upload")
     choose(page, what)
-    page.locator("[data-step=done]").wait_for()
-    return [one.partition("/files/")[2] for one in sent]
+    page.locator("[data-step=done],[role=alert]").wait_for()
+    assert page.get_by_role("alert").all_inner_texts() == []
+    return [urlsplit(one).path.partition("/files/")[2] for one in sent]
 
 
 def choose(page: Page, what: Path) -> None:
@@ -128,6 +131,47 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
     assert PIECE_BYTES <= pieces[2] < len(drive.files[name])
     stored = client.get(f"/v1/drives/{drive_of(client)}/files/{name}")
     assert stored.content == drive.files[name]
+
+
+def paths_of(document: dict[str, Any]) -> list[str]:
+    return sorted(image["file"] for frame in document["frames"] for image in frame["images"].values())
+
+
+def test_all_files_of_a_long_drive_are_known(open_console: Open, world: World, tmp_path: Path) -> None:
+    client, document = world.api.client(), manifest("long", frames=LONG_FRAMES)
+    *others, last = paths_of(document)
+    archive = archive_of(TinyDrive(document, dict.fromkeys(others, png())), tmp_path / "drive.zip")
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "upload")
+    choose(page, archive)
+    missing = f"1 of {2 * LONG_FRAMES} files that the manifest names are missing: {last}."
+    expect(page.get_by_role("alert")).to_contain_text(missing)
+
+
+@pytest.mark.parametrize("frames", [501, *slow(LONG_FRAMES)])
+def test_many_files_are_declared_in_parts(open_console: Open, world: World, tmp_path: Path, frames: int) -> None:
+    """The service knows the content of all files but two, so that these alone are sent."""
+    client, same = world.api.client(), png(seed="same")
+    client.filled(TinyDrive(manifest("known"), dict.fromkeys(tiny_drive().files, same)))
+    document = manifest("many", frames=frames)
+    paths = paths_of(document)
+    others = {path: png(seed=path) for path in (paths[0], paths[-1])}
+    folder = folder_of(TinyDrive(document, {**dict.fromkeys(paths, same), **others}), tmp_path / "drive")
+    page = open_console(world.api.url).new_page()
+    page.set_default_timeout(60_000)  # a digest is taken of each file
+    declared: list[int] = []
+
+    def count(request: Request) -> None:
+        if request.url.endswith("/files:declare"):
+            declared.append(len(request.post_data_json["files"]))
+
+    page.on("request", count)
+    log_in(page, world.api.url, client.key)
+    assert sorted(upload(page, world.api.url, folder)) == sorted(others)
+    assert declared == [1000] * (len(paths) // 1000) + [len(paths) % 1000]
+    newest, _ = client.get("/v1/drives").json()["items"]
+    assert (newest["state"], newest["files_stored"]) == ("COMMITTED", len(paths))
 
 
 def archive_of(drive: TinyDrive, path: Path, *, top: str = "my drive/", **others: bytes) -> Path:

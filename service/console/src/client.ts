@@ -101,13 +101,22 @@ export async function get<Resource>(path: string, abort?: AbortSignal): Promise<
   return (await answer.json()) as Resource;
 }
 
-/** All pages of a list, up to a bound that no project of people reaches. */
-export async function getAll<Item>(path: string, abort?: AbortSignal): Promise<Item[]> {
+/** A list to be shown, up to a bound that no project of people reaches. */
+export function getShown<Item>(path: string, abort?: AbortSignal): Promise<Item[]> {
+  return getPages<Item>(path, 200, 5000, abort);
+}
+
+/** A whole list, however long: a drive may have a million files. */
+export function getAll<Item>(path: string, abort?: AbortSignal): Promise<Item[]> {
+  return getPages<Item>(path, 1000, Infinity, abort);
+}
+
+async function getPages<Item>(path: string, limit: number, enough: number, abort?: AbortSignal): Promise<Item[]> {
   const items: Item[] = [];
   let next: string | null | undefined = "";
-  while (next !== null && next !== undefined && items.length < 5000) {
+  while (next !== null && next !== undefined && items.length < enough) {
     const cursor: string = next === "" ? "" : `&cursor=${encodeURIComponent(next)}`;
-    const page: Page<Item> = await get<Page<Item>>(`${path}${path.includes("?") ? "&" : "?"}limit=200${cursor}`, abort);
+    const page: Page<Item> = await get<Page<Item>>(`${path}${path.includes("?") ? "&" : "?"}limit=${limit}${cursor}`, abort);
     items.push(...page.items);
     next = page.next;
   }

@@ -1,6 +1,6 @@
 // Jobs as the stream tells of them, for all parts of the page.
 import { signal } from "@preact/signals";
-import { getAll, session, setSession, type Job } from "./client";
+import { getShown, session, setSession, type Job } from "./client";
 import type { Connection, FromPage, FromWorker } from "./messages";
 import { ProjectStream } from "./stream";
 
@@ -30,7 +30,7 @@ export function put(...changed: Job[]): void {
 
 async function readJobs(): Promise<void> {
   try {
-    const found = await getAll<Job>("v1/jobs");
+    const found = await getShown<Job>("v1/jobs");
     jobs.value = new Map(found.map((job) => [job.id, job]));
     epoch.value += 1;
   } catch {

@@ -1,5 +1,5 @@
 // The calibration of a scene: what changed, how well it is known, and which cameras are not what they were given as.
-import { fileUrl, get, getAll, session, type Drive, type Scene } from "../client";
+import { fileUrl, get, getShown, session, type Drive, type Scene } from "../client";
 import { Content, Empty, useLoad } from "../components";
 import { significant } from "../format";
 import { html, type Shown } from "../html";
@@ -110,7 +110,7 @@ const MOST_SCENES = 50;
 async function history(driveId: string, abort: AbortSignal): Promise<Sample[] | null> {
   const drive = await get<Drive>(`v1/drives/${driveId}`, abort);
   if (!drive.vehicle) return null;
-  const drives = await getAll<Drive>(`v1/drives?vehicle=${encodeURIComponent(drive.vehicle)}`, abort);
+  const drives = await getShown<Drive>(`v1/drives?vehicle=${encodeURIComponent(drive.vehicle)}`, abort);
   const newest = drives.slice(0, MOST_SCENES).map(async (one): Promise<Sample | null> => {
     const [scene] = (await get<{ items: Scene[] }>(`v1/scenes?drive_id=${one.id}&limit=1`, abort)).items;
     if (!scene) return null;

@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { get, getAll, send, type Drive, type Job, type Preflight, type Problem, type Scene } from "../client";
+import { get, getShown, send, type Drive, type Job, type Preflight, type Problem, type Scene } from "../client";
 import { Badge, Confirm, Content, Empty, Findings, Heading, problemOf, ProblemBox, Tile, Time, useLoad } from "../components";
 import { bytes, count, plural } from "../format";
 import { html, type Shown } from "../html";
@@ -8,7 +8,7 @@ import { go, link } from "../router";
 import { JobTable } from "./jobs";
 
 export function Drives(): Shown {
-  const loaded = useLoad((abort) => getAll<Drive>("v1/drives", abort), "drives");
+  const loaded = useLoad((abort) => getShown<Drive>("v1/drives", abort), "drives");
   const [chosen, setChosen] = useState<readonly string[]>([]);
   const choose = (id: string, isChosen: boolean): void => setChosen(isChosen ? [...chosen, id] : chosen.filter((other) => other !== id));
   return html`<${Heading} title="Drives"><a class="button primary" href=${link("upload")}>Upload a drive</a><//>
@@ -112,7 +112,7 @@ function Checks({ drive }: { drive: Drive }): Shown {
 }
 
 function ScenesOf({ drive }: { drive: Drive }): Shown {
-  const loaded = useLoad((abort) => getAll<Scene>(`v1/scenes?drive_id=${drive.id}`, abort), `scenes ${drive.id}`);
+  const loaded = useLoad((abort) => getShown<Scene>(`v1/scenes?drive_id=${drive.id}`, abort), `scenes ${drive.id}`);
   return html`<h2>Scenes</h2><${Content} of=${loaded}>${(scenes: Scene[]) =>
     scenes.length === 0 ? html`<${Empty}>No scene of this drive yet.<//>` : html`<${SceneTable} scenes=${scenes} />`}<//>`;
 }

@@ -1,6 +1,6 @@
 // Exports of a scene, one of its components, or a map's version: ask for one, and what there is.
 import { useState } from "preact/hooks";
-import { get, getAll, send, session, type Export, type ExportFormat, type ExportRequest, type Problem, type Scene } from "../client";
+import { get, getShown, send, session, type Export, type ExportFormat, type ExportRequest, type Problem, type Scene } from "../client";
 import { Badge, Confirm, Content, Empty, problemOf, ProblemBox, Time, useLoad } from "../components";
 import { bytes, count, plural } from "../format";
 import { html, type Shown } from "../html";
@@ -33,7 +33,7 @@ export function Exports(of: Exported): Shown {
 }
 
 function OfService({ base, components = [] }: Exported): Shown {
-  const loaded = useLoad((abort) => getAll<Export>(`${base}/exports`, abort), `exports ${base}`);
+  const loaded = useLoad((abort) => getShown<Export>(`${base}/exports`, abort), `exports ${base}`);
   return html`<h2>Exports</h2>
     <p class="muted">Formats that have the images in them, or a coordinate reference system of your choice, are made by a job.</p>
     <${Ask} base=${base} components=${components} asked=${loaded.again} />

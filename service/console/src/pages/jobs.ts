@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { get, getAll, send, type Drive, type Export, type Job } from "../client";
+import { get, getShown, send, type Drive, type Export, type Job } from "../client";
 import { Badge, Bar, Confirm, Content, Empty, eta, Heading, KINDS, ProblemBox, stageOf, Tile, Time, useLoad } from "../components";
 import { duration } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -32,7 +32,7 @@ export function Jobs(): Shown {
 }
 
 export function JobTable({ jobs: shown }: { jobs: readonly Job[] }): Shown {
-  const drives = useLoad((abort) => getAll<Drive>("v1/drives", abort), "names of drives");
+  const drives = useLoad((abort) => getShown<Drive>("v1/drives", abort), "names of drives");
   return html`<div class="scroll" tabindex="0" role="region" aria-label="Jobs"><table>
     <thead><tr><th scope="col">Job</th><th scope="col">State</th><th scope="col">Progress</th><th scope="col">Stage</th><th scope="col">Time left</th><th scope="col">Created</th></tr></thead>
     <tbody>

@@ -1,5 +1,5 @@
 import { useState } from "preact/hooks";
-import { fileUrl, get, getAll, send, type MapResource, type MapVersion } from "../client";
+import { fileUrl, get, getShown, send, type MapResource, type MapVersion } from "../client";
 import { Badge, Confirm, Content, Empty, Heading, ProblemBox, Tabs, Tile, Time, useLoad, type Loaded } from "../components";
 import { count, significant } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -11,7 +11,7 @@ import { Files } from "./files";
 import { hasFile, ReportParts, type Report } from "./scene";
 
 export function Maps(): Shown {
-  const loaded = useLoad((abort) => getAll<MapResource>("v1/maps", abort), "maps");
+  const loaded = useLoad((abort) => getShown<MapResource>("v1/maps", abort), "maps");
   return html`<${Heading} title="Maps" /><${Content} of=${loaded}>${(maps: MapResource[]) =>
     maps.length === 0
       ? html`<${Empty}>No map yet. Choose two or more <a href=${link("drives")}>drives</a> to make one.<//>`
@@ -154,7 +154,7 @@ function SeamBox({ seam, base }: { seam: Seam; base: string; version: MapVersion
 }
 
 function Versions({ map, changed }: { map: MapResource; changed: () => void }): Shown {
-  const loaded = useLoad((abort) => getAll<MapVersion>(`v1/maps/${map.id}/versions`, abort), `versions ${map.id} ${map.current_version}`);
+  const loaded = useLoad((abort) => getShown<MapVersion>(`v1/maps/${map.id}/versions`, abort), `versions ${map.id} ${map.current_version}`);
   return html`<${Content} of=${loaded}>${(versions: MapVersion[]) =>
     versions.length === 0 ? html`<${Empty}>No version yet.<//>` : html`<${VersionList} map=${map} versions=${versions} loaded=${loaded} changed=${changed} />`}<//>`;
 }

@@ -1,4 +1,4 @@
-import { fileUrl, get, getAll, send, session, type Finding, type Scene } from "../client";
+import { fileUrl, get, getShown, send, session, type Finding, type Scene } from "../client";
 import { Confirm, Content, Empty, Findings, Heading, Tabs, Tile, Time, useLoad } from "../components";
 import { count, duration, significant } from "../format";
 import { html, type Children, type Shown } from "../html";
@@ -16,7 +16,7 @@ export interface Report {
 }
 
 export function Scenes(): Shown {
-  const loaded = useLoad((abort) => getAll<Scene>("v1/scenes", abort), "scenes");
+  const loaded = useLoad((abort) => getShown<Scene>("v1/scenes", abort), "scenes");
   return html`<${Heading} title="Scenes" /><${Content} of=${loaded}>${(scenes: Scene[]) =>
     scenes.length === 0
       ? html`<${Empty}>No scene yet. A reconstruction makes a scene of a <a href=${link("drives")}>drive</a>.<//>`

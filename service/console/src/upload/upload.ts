@@ -7,6 +7,7 @@ import { composed, MANIFEST, type Entry, type Folder } from "./folder";
 const IN_PIECES = 8 << 20; // bytes from which on a file is sent resumably
 const PIECE = 8 << 20;
 const AT_ONE_TIME = 4;
+const DECLARED_AT_ONCE = 1000; // files; the service bounds them, and a request answers soon
 const TRIES = 6;
 const TUS = { "Tus-Resumable": "1.0.0" };
 
@@ -46,7 +47,8 @@ export async function upload(folder: Folder, say: (progress: Progress) => void, 
   const size = (path: string): number => folder.sizes.get(path)!;
   const total = (paths: Iterable<string>): number => [...paths].reduce((sum, path) => sum + size(path), 0);
   Object.assign(progress, { step: "hashes", files: named.size, totalBytes: total(named.keys()) });
-  const missing = await declare(drive, folder, named, progress, say, abort);
+  const digests = await identify(folder, named, progress, say, abort);
+  const missing = await declare(drive, folder, named, digests, abort);
   Object.assign(progress, { step: "sends", doneBytes: progress.totalBytes - total(missing.keys()), sentFiles: named.size - missing.size });
   say({ ...progress });
   await sendAll(drive, folder, named, missing, (bytes, isWhole) => {
@@ -79,8 +81,8 @@ async function openDrive(manifest: string, abort: AbortSignal): Promise<{ drive:
   return { drive: (await answer.json()) as Drive, isNew: true };
 }
 
-/** SHA-256 of the files that the service does not have, by path. */
-async function declare(drive: Drive, folder: Folder, named: ReadonlyMap<string, string>, progress: Progress, say: (progress: Progress) => void, abort: AbortSignal): Promise<ReadonlyMap<string, string>> {
+/** SHA-256 of the files that the manifest names, by path. */
+async function identify(folder: Folder, named: ReadonlyMap<string, string>, progress: Progress, say: (progress: Progress) => void, abort: AbortSignal): Promise<ReadonlyMap<string, string>> {
   const hasher = new Hasher();
   const found = new Map<string, string>();
   try {
@@ -97,10 +99,19 @@ async function declare(drive: Drive, folder: Folder, named: ReadonlyMap<string, 
   } finally {
     hasher.close();
   }
-  const files = [...found].map(([path, sha256]) => ({ path: named.get(path)!, size_bytes: folder.sizes.get(path)!, sha256 }));
-  const answer = await send("POST", `v1/drives/${drive.id}/files:declare`, { json: { files }, signal: abort });
-  const wanted = new Set(((await answer.json()) as { to_send: string[] }).to_send);
-  return new Map([...found].filter(([path]) => wanted.has(named.get(path)!)));
+  return found;
+}
+
+/** The digests of the files that the service does not have. */
+async function declare(drive: Drive, folder: Folder, named: ReadonlyMap<string, string>, digests: ReadonlyMap<string, string>, abort: AbortSignal): Promise<ReadonlyMap<string, string>> {
+  const files = [...digests].map(([path, sha256]) => ({ path: named.get(path)!, size_bytes: folder.sizes.get(path)!, sha256 }));
+  const wanted = new Set<string>();
+  for (let first = 0; first < files.length; first += DECLARED_AT_ONCE) {
+    const json = { files: files.slice(first, first + DECLARED_AT_ONCE) };
+    const answer = await send("POST", `v1/drives/${drive.id}/files:declare`, { json, signal: abort });
+    for (const path of ((await answer.json()) as { to_send: string[] }).to_send) wanted.add(path);
+  }
+  return new Map([...digests].filter(([path]) => wanted.has(named.get(path)!)));
 }
 
 async function sendAll(drive: Drive, folder: Folder, named: ReadonlyMap<string, string>, missing: ReadonlyMap<string, string>, sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
