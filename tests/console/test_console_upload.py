@@ -10,7 +10,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from playwright.sync_api import Page, Request, expect
+from playwright.sync_api import Page, Request, Route, expect
 
 from tests.console.conftest import Open, World, go, log_in
 from tests.helpers.live_api import Client
@@ -19,6 +19,9 @@ from tests.helpers.tiny_drive import TinyDrive, manifest, png, tiny_drive
 
 PIECE_BYTES = 8 << 20
 LONG_FRAMES = 2600  # of two cameras: more files than a list on a page has entries
+TRIES = 6
+# A page with this script waits a fiftieth of the time before it tries again.
+IMPATIENT = "const wait = window.setTimeout; window.setTimeout = (work, ms) => wait(work, ms / 50);"
 
 
 def folder_of(drive: TinyDrive, folder: Path) -> Path:
@@ -131,6 +134,81 @@ def test_a_large_file_goes_in_pieces_and_on_in_another_browser(
     assert PIECE_BYTES <= pieces[2] < len(drive.files[name])
     stored = client.get(f"/v1/drives/{drive_of(client)}/files/{name}")
     assert stored.content == drive.files[name]
+
+
+def with_large_file(name: str) -> tuple[TinyDrive, str]:
+    """A drive with one file that is sent in two pieces, and that file's path."""
+    drive = tiny_drive(name, seed=name)
+    path = min(drive.files)
+    drive.files[path] += bytes(PIECE_BYTES + 5000)  # after the picture's end
+    return drive, path
+
+
+def offset_of(request: Request) -> int:
+    return int(request.headers["upload-offset"])
+
+
+def test_a_large_file_goes_on_where_the_service_is(open_console: Open, world: World, tmp_path: Path) -> None:
+    """An answer is lost, the upload is locked for a while, another browser sends a part: no byte comes twice."""
+    client, (drive, path) = world.api.client(), with_large_file("lost answer")
+    watched = open_console(world.api.url)
+    watched.expected = ("ERR_CONNECTION_RESET", "status of 409", "status of 423")
+    page = watched.new_page()
+    page.add_init_script(IMPATIENT)
+    methods: list[str] = []
+    offsets: list[int] = []
+
+    def append(request: Request, size_bytes: int) -> None:
+        names = ("tus-resumable", "upload-offset", "content-type")
+        headers = {name: request.headers[name] for name in names}
+        client.patch(request.url, content=drive.files[path][offset_of(request) :][:size_bytes], headers=headers)
+
+    def disturb(route: Route) -> None:
+        request = route.request
+        methods.append(request.method)
+        if request.method == "PATCH":
+            offsets.append(offset_of(request))
+        match request.method, methods.count(request.method):
+            case "PATCH", 1:
+                append(request, PIECE_BYTES)
+                route.abort("connectionreset")
+            case "HEAD", 1:
+                route.fulfill(status=423)
+            case "PATCH", 2:
+                append(request, 1000)
+                route.continue_()
+            case _:
+                route.continue_()
+
+    page.route("**/uploads/*", disturb)
+    log_in(page, world.api.url, client.key)
+    upload(page, world.api.url, folder_of(drive, tmp_path / "drive"))
+    assert offsets == [0, PIECE_BYTES, PIECE_BYTES + 1000]
+    assert client.get(f"/v1/drives/{drive_of(client)}/files/{path}").content == drive.files[path]
+
+
+def test_a_large_file_that_gets_no_further_is_given_up(open_console: Open, world: World, tmp_path: Path) -> None:
+    client, (drive, _) = world.api.client(), with_large_file("no further")
+    watched = open_console(world.api.url)
+    watched.expected = ("ERR_CONNECTION_RESET",)
+    page = watched.new_page()
+    page.add_init_script(IMPATIENT)
+    offsets: list[int] = []
+
+    def cut(route: Route) -> None:
+        if route.request.method == "PATCH":
+            offsets.append(offset_of(route.request))
+        if len(offsets) > 1 and route.request.method == "PATCH":
+            route.abort("connectionreset")
+        else:
+            route.continue_()
+
+    page.route("**/uploads/*", cut)
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "upload")
+    choose(page, folder_of(drive, tmp_path / "drive"))
+    page.get_by_role("alert").wait_for()
+    assert offsets == [0, *[PIECE_BYTES] * TRIES]
 
 
 def paths_of(document: dict[str, Any]) -> list[str]:

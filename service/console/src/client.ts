@@ -84,16 +84,15 @@ export async function send(method: string, path: string, options: Options = {}):
     );
   }
   if (answer.ok) return answer;
-  throw await problemOf(answer);
+  throw await refusalOf(answer);
 }
 
-async function problemOf(answer: Response): Promise<ProblemError> {
+export async function refusalOf(answer: Response): Promise<ProblemError> {
   if (answer.status === 401) setSession(null);
   const isProblem = answer.headers.get("content-type")?.startsWith("application/problem+json");
-  const problem = isProblem
-    ? ((await answer.json()) as Problem)
-    : { title: `HTTP ${answer.status}`, detail: answer.statusText || "No details.", remedy: "Try again." };
-  return new ProblemError(problem, answer.status);
+  const problem = isProblem ? await (answer.json() as Promise<Problem>).catch(() => null) : null; // HEAD gives no body
+  const unknown = { title: `HTTP ${answer.status}`, detail: answer.statusText || "No details.", remedy: "Try again." };
+  return new ProblemError(problem ?? unknown, answer.status);
 }
 
 export async function get<Resource>(path: string, abort?: AbortSignal): Promise<Resource> {

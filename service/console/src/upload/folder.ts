@@ -9,6 +9,10 @@ export interface Entry {
   crc32?: number; // of the content, where an archive says it
 }
 
+export interface Identified extends Entry {
+  sha256: string;
+}
+
 export interface Folder {
   what: "folder" | "archive";
   sizes: ReadonlyMap<string, number>; // bytes by path

@@ -1,15 +1,13 @@
 // The upload of a drive. What the service has is asked, not remembered: another browser goes on where this one stopped.
-import { fileUrl, getAll, ProblemError, send, type Drive, type Upload } from "../client";
+import { fileUrl, getAll, ProblemError, send, type Drive } from "../client";
 import { Hasher } from "./hashing";
 import { requireExpected } from "./archive";
-import { composed, MANIFEST, type Entry, type Folder } from "./folder";
+import { composed, MANIFEST, type Folder, type Identified } from "./folder";
+import { again, require } from "./requests";
+import { IN_PIECES, sendInPieces } from "./resumable";
 
-const IN_PIECES = 8 << 20; // bytes from which on a file is sent resumably
-const PIECE = 8 << 20;
 const AT_ONE_TIME = 4;
 const DECLARED_AT_ONCE = 1000; // files; the service bounds them, and a request answers soon
-const TRIES = 6;
-const TUS = { "Tus-Resumable": "1.0.0" };
 
 export interface Progress {
   step: "creates" | "hashes" | "sends" | "commits" | "done";
@@ -22,9 +20,6 @@ interface DriveFile {
   path: string;
   sha256?: string | null;
   size_bytes?: number | null;
-}
-interface Sent extends Entry {
-  sha256: string;
 }
 
 function refuse(folder: Folder, detail: string, remedy: string): ProblemError {
@@ -108,7 +103,7 @@ async function declare(drive: Drive, folder: Folder, named: ReadonlyMap<string, 
   const wanted = new Set<string>();
   for (let first = 0; first < files.length; first += DECLARED_AT_ONCE) {
     const json = { files: files.slice(first, first + DECLARED_AT_ONCE) };
-    const answer = await send("POST", `v1/drives/${drive.id}/files:declare`, { json, signal: abort });
+    const answer = await again(() => send("POST", `v1/drives/${drive.id}/files:declare`, { json, signal: abort }), abort);
     for (const path of ((await answer.json()) as { to_send: string[] }).to_send) wanted.add(path);
   }
   return new Map([...digests].filter(([path]) => wanted.has(named.get(path)!)));
@@ -119,8 +114,10 @@ async function sendAll(drive: Drive, folder: Folder, named: ReadonlyMap<string, 
   const work = async (): Promise<void> => {
     for (let next = await entries.next(); !next.done; next = await entries.next()) {
       const one = { ...next.value, path: named.get(next.value.path)!, sha256: missing.get(next.value.path)! };
-      if (one.file.size >= IN_PIECES) await inPieces(drive, one, sent, abort);
-      else {
+      if (one.file.size >= IN_PIECES) {
+        await sendInPieces(drive, one, (bytes) => sent(bytes, false), abort);
+        sent(0, true);
+      } else {
         await again(() => put(drive, one, abort), abort);
         sent(one.file.size, true);
       }
@@ -129,66 +126,11 @@ async function sendAll(drive: Drive, folder: Folder, named: ReadonlyMap<string, 
   await Promise.all(Array.from({ length: AT_ONE_TIME }, work));
 }
 
-async function put(drive: Drive, { path, file, sha256 }: Sent, abort: AbortSignal): Promise<void> {
+async function put(drive: Drive, { path, file, sha256 }: Identified, abort: AbortSignal): Promise<void> {
   const answer = await fetch(fileUrl(`v1/drives/${drive.id}`, path), { method: "PUT", body: file, headers: { "Content-Digest": `sha-256=:${base64OfHex(sha256)}:` }, signal: abort });
   await require(answer);
 }
 
-async function inPieces(drive: Drive, { path, file, sha256 }: Sent, sent: (bytes: number, isWhole: boolean) => void, abort: AbortSignal): Promise<void> {
-  let url = await begun(drive, path, sha256, abort);
-  let offset = url ? await offsetOf(url, abort) : null;
-  if (url === null || offset === null) {
-    const metadata = `path ${base64OfText(path)},sha256 ${base64OfText(sha256)}`;
-    const answer = await require(await fetch(`v1/drives/${drive.id}/uploads`, { method: "POST", headers: { ...TUS, "Upload-Length": String(file.size), "Upload-Metadata": metadata }, signal: abort }));
-    url = answer.headers.get("location")!.replace(/^\//, "");
-    offset = 0;
-  }
-  sent(offset, false);
-  while (offset < file.size) {
-    const from: number = offset;
-    const target = url;
-    const piece = file.slice(from, from + PIECE);
-    const answer = await again(async () => require(await fetch(target, { method: "PATCH", body: piece, headers: { ...TUS, "Upload-Offset": String(from), "Content-Type": "application/offset+octet-stream" }, signal: abort })), abort);
-    offset = Number(answer.headers.get("upload-offset"));
-    sent(offset - from, offset >= file.size);
-  }
-}
-
-/** The upload of this file that another page, or another browser, has begun. */
-async function begun(drive: Drive, path: string, sha256: string, abort: AbortSignal): Promise<string | null> {
-  const found = (await getAll<Upload>(`v1/drives/${drive.id}/uploads?sha256=${sha256}`, abort)).find((upload) => upload.path === path);
-  return found ? `v1/drives/${drive.id}/uploads/${found.id}` : null;
-}
-
-async function offsetOf(url: string, abort: AbortSignal): Promise<number | null> {
-  const answer = await fetch(url, { method: "HEAD", headers: TUS, signal: abort });
-  return answer.ok ? Number(answer.headers.get("upload-offset")) : null;
-}
-
-async function require(answer: Response): Promise<Response> {
-  if (answer.ok) return answer;
-  const isProblem = answer.headers.get("content-type")?.startsWith("application/problem+json");
-  const problem = isProblem ? await answer.json() : { title: `HTTP ${answer.status}`, detail: answer.statusText, remedy: "Try again." };
-  throw new ProblemError(problem, answer.status);
-}
-
-/** Once more, later, where the service or the way to it was at fault. */
-async function again<Value>(work: () => Promise<Value>, abort: AbortSignal): Promise<Value> {
-  for (let tried = 1; ; tried += 1) {
-    try {
-      return await work();
-    } catch (error) {
-      const isPassing = !(error instanceof ProblemError) || error.status >= 500 || error.status === 423 || error.status === 429;
-      if (abort.aborted || !isPassing || tried >= TRIES) throw error;
-      await new Promise((done) => setTimeout(done, 500 * 2 ** tried));
-    }
-  }
-}
-
 function base64OfHex(hex: string): string {
   return btoa(String.fromCharCode(...hex.match(/../g)!.map((byte) => parseInt(byte, 16))));
-}
-
-function base64OfText(text: string): string {
-  return btoa(String.fromCharCode(...new TextEncoder().encode(text)));
 }
