@@ -211,6 +211,23 @@ def test_a_large_file_that_gets_no_further_is_given_up(open_console: Open, world
     assert offsets == [0, *[PIECE_BYTES] * TRIES]
 
 
+def test_a_corrected_image_replaces_the_one_that_was_sent(open_console: Open, world: World, tmp_path: Path) -> None:
+    """As long as the drive is open; in one piece and in several."""
+    client, (drive, large) = world.api.client(), with_large_file("corrected")
+    small = max(drive.files)
+    before = {
+        path: png(seed=f"before {path}") if path in (small, large) else data for path, data in drive.files.items()
+    }
+    drive_id = client.create(drive)
+    client.send_files(drive_id, TinyDrive(drive.manifest, before))
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, client.key)
+    assert upload(page, world.api.url, folder_of(drive, tmp_path / "drive")) == [small]
+    assert drive_of(client) == drive_id
+    for path in (small, large):
+        assert client.get(f"/v1/drives/{drive_id}/files/{path}").content == drive.files[path]
+
+
 def paths_of(document: dict[str, Any]) -> list[str]:
     return sorted(image["file"] for frame in document["frames"] for image in frame["images"].values())
 

@@ -57,7 +57,8 @@ async function offsetOf(url: string, abort: AbortSignal): Promise<number | null>
 }
 
 async function create(uploads: string, { path, file, sha256 }: Identified, abort: AbortSignal): Promise<Position> {
-  const metadata = `path ${base64OfText(path)},sha256 ${base64OfText(sha256)}`;
+  const given = { path, sha256, replace: "true" };
+  const metadata = Object.entries(given).map(([name, value]) => `${name} ${base64OfText(value)}`).join(",");
   // By its key a repetition is known: each upload counts with all of its bytes.
   const headers = { ...TUS, "Upload-Length": String(file.size), "Upload-Metadata": metadata, "Idempotency-Key": randomName() };
   const answer = await again(async () => require(await fetch(uploads, { method: "POST", headers, signal: abort })), abort);

@@ -126,8 +126,9 @@ async function sendAll(drive: Drive, folder: Folder, named: ReadonlyMap<string, 
   await Promise.all(Array.from({ length: AT_ONE_TIME }, work));
 }
 
+/** Sends a small file. The drive has this manifest: where a file was changed here since it was sent, the new bytes count. */
 async function put(drive: Drive, { path, file, sha256 }: Identified, abort: AbortSignal): Promise<void> {
-  const answer = await fetch(fileUrl(`v1/drives/${drive.id}`, path), { method: "PUT", body: file, headers: { "Content-Digest": `sha-256=:${base64OfHex(sha256)}:` }, signal: abort });
+  const answer = await fetch(`${fileUrl(`v1/drives/${drive.id}`, path)}?replace=true`, { method: "PUT", body: file, headers: { "Content-Digest": `sha-256=:${base64OfHex(sha256)}:` }, signal: abort });
   await require(answer);
 }
 
