@@ -7,9 +7,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from playwright.sync_api import Page, expect
+from playwright.sync_api import APIResponse, Locator, Page, Route, expect
+from sqlalchemy import delete
 
 from schemas.api.problems import Problem
+from service.database.tables import Job
 from service.domain import jobs
 from service.domain.jobs import Claim, ProgressNote
 from service.storage.artifacts import ArtifactStore
@@ -85,6 +87,48 @@ def test_a_failed_job_shows_its_problem_and_the_end_of_its_log(open_console: Ope
     expect(box).to_contain_text("the process ended with signal 6")
     expect(box).to_contain_text("Report it with the end of the log.")
     expect(box.locator("pre")).to_have_text("line one\nline two")
+
+
+def test_a_list_that_was_read_earlier_hides_no_news(open_console: Open, world: World) -> None:
+    """Neither what the stream said since, nor what a later list says."""
+    client = world.api.client()
+    ended, deleted = (client.reconstruct(client.frozen(tiny_drive(name, seed=name)))["id"] for name in ("a", "b"))
+    held = client.claim(ended)
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "jobs")
+    page.locator("[data-connection=live]").wait_for()
+    read: list[tuple[Route, APIResponse]] = []
+    page.route("**/v1/jobs?*", lambda route: read.append((route, route.fetch())))
+
+    def row(job_id: str) -> Locator:
+        return page.locator("tbody tr", has=page.locator(f"a[href$='{job_id}']"))
+
+    def read_list() -> None:
+        before = len(read)
+        page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+        while len(read) == before:
+            page.wait_for_timeout(20)
+
+    def arrive(i: int) -> None:
+        route, answer = read[i]
+        route.fulfill(response=answer)
+        page.wait_for_timeout(200)  # for what must not come
+
+    read_list()
+    client.publish(held, {"points.ply": b"ply"})
+    expect(row(ended).locator(".badge")).to_have_text("succeeded")
+    arrive(0)
+    expect(row(ended).locator(".badge")).to_have_text("succeeded")
+    read_list()
+    with world.api.database.write() as session:
+        session.execute(delete(Job).where(Job.id == deleted))
+    read_list()
+    arrive(2)
+    expect(row(deleted)).to_have_count(0)
+    arrive(1)
+    expect(row(deleted)).to_have_count(0)
+    expect(row(ended).locator(".badge")).to_have_text("succeeded")
 
 
 @pytest.mark.slow

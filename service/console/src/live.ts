@@ -11,6 +11,8 @@ export const epoch = signal(0);
 
 const ENDED = ["SUCCEEDED", "FAILED", "CANCELLED"];
 let tell: ((message: FromPage) => void) | null = null;
+/** For each read of the list under way, oldest first: the jobs put since it began, which its answer may show as before. */
+const reads = new Set<Map<string, Job>>();
 
 export function hasEnded(job: Job): boolean {
   return ENDED.includes(job.state);
@@ -23,18 +25,30 @@ export function put(...changed: Job[]): void {
     const before = next.get(job.id);
     isNews ||= !before || (hasEnded(job) && !hasEnded(before));
     next.set(job.id, job);
+    for (const since of reads) since.set(job.id, job);
   }
   jobs.value = next;
   if (isNews) epoch.value += 1;
 }
 
 async function readJobs(): Promise<void> {
+  const since = new Map<string, Job>();
+  reads.add(since);
   try {
     const found = await getShown<Job>("v1/jobs");
-    jobs.value = new Map(found.map((job) => [job.id, job]));
+    if (!reads.has(since)) return; // a later read was sooner here
+    forgetUntil(since);
+    jobs.value = new Map([...found.map((job): [string, Job] => [job.id, job]), ...since]);
     epoch.value += 1;
   } catch {
-    // Said by the connection; the stream's next start reads them again.
+    reads.delete(since); // said by the connection; the stream's next start reads them again
+  }
+}
+
+function forgetUntil(last: Map<string, Job>): void {
+  for (const read of reads) {
+    reads.delete(read);
+    if (read === last) return;
   }
 }
 
@@ -61,6 +75,7 @@ export function follow(): void {
 export function unfollow(): void {
   tell?.({ type: "leaves" });
   tell = null;
+  reads.clear(); // whoever logs in next has other jobs
   jobs.value = null;
 }
 
