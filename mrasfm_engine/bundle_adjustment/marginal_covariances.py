@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -28,6 +28,7 @@ class Covariances:
     sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
     sigma_camera: Floats  # (c, CAMERA_DOF) in the order of `problem`; NaN for fixed cameras, 0 for what is held
     sigma_scale: float  # relative, of the trajectory's size
+    from_fixed_m: Floats  # (u, 3) places of units from what stays where it is when the scene's size changes
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
     calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
     # (6 c,) covariance of the scale with these, as the adjustment weighs errors; NaN where it is not known
@@ -35,12 +36,20 @@ class Covariances:
     times_s2: Floats  # (c, c) of the free cameras' time offsets, (0, 0) where none has a place
     times_of_independent_errors_s2: Floats  # (c, c) the same as the adjustment weighs them
 
+    def with_scale_error(self, sigma: float) -> Covariances:
+        """The same with an error more of the scale, relative, and with that of all positions."""
+        return replace(
+            self,
+            sigma_scale=float(np.hypot(self.sigma_scale, sigma)),
+            sigma_unit_position_m=np.hypot(self.sigma_unit_position_m, sigma * self.from_fixed_m),
+        )
+
 
 def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -> Covariances:
     """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).
 
     With `shared_errors` those of the cameras and of the scale have what errors add that the observations of a unit
-    share, see the module of that name.
+    share, see the module of that name. Positions have what the scale's adds.
 
     Scale is the functional sum (p_i - mean)' dp_i / sum |p_i - mean|^2 of the free units' positions: it does not change
     when the scene is moved or turned. What nothing determines has an infinite sigma; which unknowns share in that is
@@ -60,16 +69,31 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
     places = dof * np.arange(layout.num_cameras)
     poses = np.ix_(*[(places[:, None] + np.arange(6)).ravel()] * 2)
     times = np.ix_(*[places[: len(places) if dof > TIME else 0] + TIME] * 2)
-    return Covariances(
+    result = Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
-        sigma_scale=found.sigma_scale,
+        sigma_scale=found.sigma_scale_of_independent_errors,
+        from_fixed_m=_from_fixed_m(problem, state),
         calibration=found.cameras[poses],
         calibration_of_independent_errors=found.cameras_of_independent_errors[poses],
         scale_with_calibration=found.scale_with_cameras[poses[0].ravel()],
         times_s2=found.cameras[times],
         times_of_independent_errors_s2=found.cameras_of_independent_errors[times],
     )
+    if not np.isfinite(found.sigma_scale):
+        return replace(result, sigma_scale=found.sigma_scale)
+    more = found.sigma_scale**2 - found.sigma_scale_of_independent_errors**2
+    return replace(result.with_scale_error(np.sqrt(max(more, 0.0))), sigma_scale=found.sigma_scale)
+
+
+def _from_fixed_m(problem: Problem, state: State) -> Floats:
+    """Places (u, 3) of all units from those that are held, or, where none is, from the middle of the free ones."""
+    free = problem.layout.unit_slot >= 0
+    seen = np.zeros(len(free), dtype=np.bool_)
+    seen[problem.observations.unit] = True
+    held = seen & ~free
+    result: Floats = state.unit_position_m - state.unit_position_m[held if held.any() else free].mean(axis=0)
+    return result
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,6 +103,7 @@ class _Marginals:
     cameras_of_independent_errors: Floats  # (d c, d c)
     scale_with_cameras: Floats  # (d c,) as the adjustment weighs errors
     sigma_scale: float
+    sigma_scale_of_independent_errors: float
 
 
 def _regular_marginals(
@@ -97,6 +122,7 @@ def _regular_marginals(
     joint, of_readouts = _of_functionals(problem, state, eliminated, border)[1:]
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
+    of_independent = joint[-1, -1]
     if shared_errors:
         joint = _with_shared_errors(problem, state, unseen, joint)
     joint = joint + of_readouts
@@ -105,17 +131,18 @@ def _regular_marginals(
     for covariance, found in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
         covariance[np.ix_(eliminated.free, eliminated.free)] = found
         covariance[loose, loose] = np.inf
-    scale = float("nan")
+    scale = scale_of_independent = float("nan")
     if np.isinf(variance[:, 3:]).any():
-        scale = np.inf
+        scale = scale_of_independent = np.inf
     elif layout.num_units >= 2:
-        scale = _sigma_scale(joint[-1, -1])
+        scale, scale_of_independent = _sigma_scale(joint[-1, -1]), _sigma_scale(of_independent)
     return _Marginals(
         units=np.maximum(variance, 0.0),
         cameras=covariances_of_cameras[0],
         cameras_of_independent_errors=covariances_of_cameras[1],
         scale_with_cameras=scale_with_cameras,
         sigma_scale=scale,
+        sigma_scale_of_independent_errors=scale_of_independent,
     )
 
 
@@ -194,6 +221,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
             cameras_of_independent_errors=cameras,
             scale_with_cameras=np.full(size - split, np.nan),
             sigma_scale=np.inf,
+            sigma_scale_of_independent_errors=np.inf,
         )
     matrix = system.matrix
     free = np.setdiff1d(np.arange(size), layout.held())
@@ -220,6 +248,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
         cameras_of_independent_errors=cameras,
         scale_with_cameras=scale_with_cameras,
         sigma_scale=scale,
+        sigma_scale_of_independent_errors=scale,
     )
 
 

@@ -170,4 +170,4 @@ def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Cova
     """The certainty with what lens models and given rotations leave open of the scale, where positions do not tell."""
     if certainty is None or result.given_scale is None:
         return certainty
-    return replace(certainty, sigma_scale=float(np.hypot(certainty.sigma_scale, result.given_scale.sigma_scale)))
+    return certainty.with_scale_error(result.given_scale.sigma_scale)

@@ -174,3 +174,17 @@ def test_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> No
     assert verdict.sigma_scale == pytest.approx(verdict.prior_sigma_scale, rel=0.05)
     mean = np.kron(np.ones((1, 4)) / 4, np.eye(6))
     assert np.sqrt(np.diagonal(mean @ found.calibration @ mean.T))[3:].max() < 1e-3 * 0.05  # it is held
+
+
+def test_positions_are_no_more_certain_than_the_scale() -> None:
+    """Errors that observations share, and those of lens models, change the scene's size: all places move with it."""
+    case = stereo(0, units=12)
+    problem = replace(case.problem, terms=[prior_of(case.truth)])
+    found, alone = (covariances(problem, case.truth, shared_errors=shared) for shared in (True, False))
+    away_m = case.truth.unit_position_m - case.truth.unit_position_m[0]  # the first unit is held
+    np.testing.assert_allclose(found.from_fixed_m, away_m)
+    for certainty in (found, alone, alone.with_scale_error(0.1)):
+        sigma_m = np.linalg.norm(certainty.sigma_unit_position_m[1:], axis=1)
+        assert (sigma_m[-3:] > 0.9 * certainty.sigma_scale * np.linalg.norm(away_m[-3:], axis=1)).all()
+    assert alone.with_scale_error(0.1).sigma_scale == pytest.approx(np.hypot(alone.sigma_scale, 0.1))
+    assert found.sigma_scale != alone.sigma_scale
