@@ -94,7 +94,8 @@ def create(
     if of_map.current_version is None:
         of_map.expires_us = job_expires_us  # its record is all there is of it, until a version is published
     settings = asked.settings.model_dump(mode="json", exclude_none=True)
-    # Before anything locks the project, as a new job does: who publishes a scene holds its job and wants the project.
+    # Before the project is locked, as a new job does: who publishes a scene holds its job and wants the project. The
+    # row of a new map holds only the project's key, and others hold that beside the lock.
     _find_what_is_there(session, plan, settings)
     _require_quota(session, project_id, plan)
     job = jobs.create(

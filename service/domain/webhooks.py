@@ -81,7 +81,8 @@ def create(session: Session, *, project_id: str, asked: WebhookRequest, allow_pr
         422 where it may not be told anything; 429 where the project has as many as it may.
     """
     require_url(asked.url, allow_private=allow_private)
-    session.get_one(Project, project_id, with_for_update=True)  # two requests cannot take the last place together
+    # Locked, so that two requests cannot take the last place together. Not its key, which each new row holds.
+    session.get_one(Project, project_id, with_for_update={"key_share": True})
     count = session.scalar(select(func.count()).select_from(Webhook).where(Webhook.project_id == project_id)) or 0
     if count >= MAX_OF_PROJECT:
         raise TooManyWebhooks(

@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
 
 import pytest
 from sqlalchemy import select, text, update
@@ -201,3 +202,21 @@ def sweep(settings: Settings) -> None:
 def _members(database: Database, job_id: str) -> list[tuple[JobMember, Job | None]]:
     with database.read() as session:
         return jobs.members_of(session, [job_id])[job_id]
+
+
+def test_two_new_maps_are_asked_for_at_one_time(
+    database: Database, project_id: str, drives: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both have recorded their map when the first of them takes its places in the project's quota."""
+    made = [publish(database, reconstructing(database, project_id, drive)) for drive in drives]
+    require_places, both = jobs.require_places, threading.Barrier(2)
+
+    def require_places_together(session: Session, project_id: str, count: int) -> None:
+        with suppress(threading.BrokenBarrierError):  # SQLite's writers take turns
+            both.wait(0.5)
+        require_places(session, project_id, count)
+
+    monkeypatch.setattr(jobs, "require_places", require_places_together)
+    with ThreadPoolExecutor(2) as pool:
+        asked = list(pool.map(lambda _: ask(database, project_id, scenes=made), range(2)))
+    assert len({job.map_id for job in asked}) == 2

@@ -87,8 +87,9 @@ def require_places(session: Session, project_id: str, count: int) -> None:
     ServiceError
         429 for the count; 413 where the project's space is used up: results may exceed it, but each job adds to them.
     """
-    # Locked, so that two requests cannot take the last place together.
-    project = session.get_one(Project, project_id, with_for_update=True)
+    # Locked, so that two requests cannot take the last place together. Not its key: each row that names the project
+    # holds that, and two transactions that have written such a row would wait for each other.
+    project = session.get_one(Project, project_id, with_for_update={"key_share": True})
     if project.used_bytes >= project.max_bytes:
         raise QuotaFull(
             f"{project.used_bytes} of {project.max_bytes} bytes are used: there is no space for what a job makes",
