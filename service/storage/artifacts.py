@@ -14,6 +14,7 @@ import os
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
@@ -38,6 +39,11 @@ _RETRIES = {"max_retries": 3, "retry_timeout": timedelta(seconds=15)}
 # Whether the store can be used is asked often, and a late answer is of no use.
 _PROBE_TIMEOUTS = {"connect_timeout": timedelta(seconds=3), "timeout": timedelta(seconds=3)}
 _PROBE_RETRIES = {"max_retries": 0}
+# Outside a folder each object takes a round trip or several. Of many files a process holds at most this many in memory,
+# with the parts of each 160 MB.
+_PUTS = 16
+_PUTS_OF_REQUEST = 8
+_PARTS_OF_PUT = 2  # of 5 MiB
 
 Fetch = Callable[[str, Path], None]  # as `ArtifactStore.fetch`: key, target
 
@@ -62,6 +68,7 @@ class ArtifactStore:
         self._store: Any = None
         self._probed: Any = None
         self._safe_folders: set[Path] = set()
+        self._putting = ThreadPoolExecutor(_PUTS, thread_name_prefix="put")  # has no thread before it is used
         if url.startswith("file://"):
             self._root = Path(unquote(urlsplit(url).path))
             self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -103,6 +110,30 @@ class ArtifactStore:
             path.unlink()
         if durable:
             self.sync(key)
+
+    def put_files(self, files: Iterable[tuple[Path, str]], *, durable: bool = True) -> None:
+        """Make each file an object, several at one time where the store is not a folder; see `put_file`.
+
+        Where one fails, this raises when none is under way any more; some of the objects are there then.
+        """
+        if self._root is not None:
+            for path, key in files:
+                self.put_file(path, key, durable=durable)
+            return
+        under_way: set[Future[None]] = set()
+        try:
+            for path, key in files:
+                if len(under_way) == _PUTS_OF_REQUEST:
+                    done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
+                    _require_done(done)
+                under_way.add(self._putting.submit(self._put_beside_others, path, key))
+        finally:
+            wait(under_way)
+        _require_done(under_way)
+
+    def _put_beside_others(self, path: Path, key: str) -> None:
+        obstore.put(self._store, key, path, max_concurrency=_PARTS_OF_PUT)
+        path.unlink()
 
     def sync(self, key: str) -> None:
         """Return when the object survives a power cut.
@@ -251,6 +282,12 @@ class ArtifactStore:
         else:
             obstore.put(self._probed, key, b"probe")
             obstore.delete(self._probed, key)
+
+
+def _require_done(puts: Iterable[Future[None]]) -> None:
+    """Raise what one of the puts that have ended has raised."""
+    for put in puts:
+        put.result()
 
 
 def _open(url: str, settings: Settings, timeouts: Mapping[str, Any], retries: Mapping[str, Any]) -> Any:

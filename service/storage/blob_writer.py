@@ -16,6 +16,7 @@ from service.database.tables import Blob, now_us
 from service.storage import blobs
 from service.storage.artifacts import ArtifactStore
 from service.storage.durability import boot_id
+from service.storage.spool import Spooled
 
 _CHUNK_BYTES = 1 << 20
 _BATCH = 500
@@ -69,9 +70,14 @@ def store_file(
 
 
 def _put(artifacts: ArtifactStore, path: Path, key: str, *, sha256: str, size_bytes: int, durable: bool) -> StoredFile:
-    boot = None if durable or artifacts.folder is None else boot_id()
+    boot = _boot_of(artifacts, durable=durable)
     artifacts.put_file(path, key, durable=boot is None)
     return StoredFile(sha256=sha256, size_bytes=size_bytes, key=key, is_new=True, written_in_boot=boot)
+
+
+def _boot_of(artifacts: ArtifactStore, *, durable: bool) -> str | None:
+    """The start of the machine in which objects are written that a power cut could take; else None."""
+    return None if durable or artifacts.folder is None else boot_id()
 
 
 def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
@@ -100,7 +106,7 @@ class BlobWriter:
         self._artifacts = artifacts
         self._project_id = project_id
         self._new: set[str] = set()
-        self._recorded_us = now_us()
+        self._recorded_us = 0
         self._unused: list[blobs.Recorded] = []
 
     def __enter__(self) -> BlobWriter:
@@ -120,6 +126,24 @@ class BlobWriter:
         self._new.add(key)
         return _put(self._artifacts, path, key, sha256=sha256, size_bytes=size_bytes, durable=self._durable)
 
+    def store_all(self, files: Sequence[Spooled]) -> list[StoredFile]:
+        """Make many files of the spool objects, some of them at one time; as a call for each."""
+        boot = _boot_of(self._artifacts, durable=self._durable)
+        stored = [
+            StoredFile(
+                sha256=file.sha256,
+                size_bytes=file.size_bytes,
+                key=blobs.new_key(self._project_id, file.sha256),
+                is_new=True,
+                written_in_boot=boot,
+            )
+            for file in files
+        ]
+        self._new.update(file.key for file in stored)
+        paths = ((spooled.path, file.key) for spooled, file in zip(files, stored, strict=True))
+        self._artifacts.put_files(paths, durable=boot is None)
+        return stored
+
     def recorded(self, key: str) -> None:
         """Note that a transaction that has committed names this object."""
         self._new.discard(key)
@@ -128,7 +152,8 @@ class BlobWriter:
         """Blobs of stored files, by digest, before anything refers to them.
 
         In several short transactions, so that others write in between. What is recorded is taken back at the block's
-        end, unless `used` says that it is needed; where the process is killed before, it is collected later.
+        end, unless `used` says that it is needed; where the process is killed before, it is collected later. Once in a
+        block.
 
         Raises
         ------
@@ -136,6 +161,8 @@ class BlobWriter:
             413 where the project's quota would be exceeded.
         """
         found: dict[str, blobs.Recorded] = {}
+        # Not the block's begin: the bytes may have taken longer than unused ones are kept.
+        self._recorded_us = now_us()
         unlike = list({file.sha256: file for file in files}.values())
         for i in range(0, len(unlike), _BATCH):
             contents = [file.identity for file in unlike[i : i + _BATCH]]

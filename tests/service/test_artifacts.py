@@ -8,12 +8,15 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import boto3
+import obstore
 import pytest
 from obstore.exceptions import BaseError
 
@@ -132,6 +135,66 @@ def test_objects_say_when_they_came(stored: ArtifactStore) -> None:
 
 def test_a_store_that_can_be_written(store: ArtifactStore) -> None:
     store.require_writable()
+    assert list(store.objects()) == []
+
+
+@pytest.fixture
+def twenty(tmp_path: Path) -> list[tuple[Path, str]]:
+    """Files that are to be objects."""
+    files = [(tmp_path / f"{i}", f"blobs/{i}") for i in range(20)]
+    for path, key in files:
+        path.write_text(key)
+    return files
+
+
+class SlowPuts:
+    """`obstore.put`, which takes a while; counts those under way."""
+
+    def __init__(self, failing: str | None = None) -> None:
+        self._put, self._failing, self._lock = obstore.put, failing, threading.Lock()
+        self.under_way = self.most = 0
+
+    def __call__(self, store: Any, key: str, path: Path, **options: Any) -> None:
+        with self._lock:
+            self.under_way += 1
+            self.most = max(self.most, self.under_way)
+        try:
+            time.sleep(0.05)
+            if key == self._failing:
+                raise OSError("the store is away")
+            self._put(store, key, path, **options)
+        finally:
+            with self._lock:
+                self.under_way -= 1
+
+
+def test_many_files_are_put_at_one_time(
+    store: ArtifactStore, twenty: list[tuple[Path, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    puts = SlowPuts()
+    monkeypatch.setattr(obstore, "put", puts)
+    store.put_files(twenty)
+    assert {key: store.read(key).decode() for _, key in twenty} == {key: key for _, key in twenty}
+    assert not any(path.exists() for path, _ in twenty)
+    assert puts.most == (8 if store.folder is None else 0)
+
+
+def test_a_put_that_fails_leaves_none_under_way(
+    store: ArtifactStore, twenty: list[tuple[Path, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who takes back what is there finds all of it."""
+    if store.folder is not None:
+        twenty[3][0].unlink()
+        with pytest.raises(FileNotFoundError):
+            store.put_files(twenty)
+        return
+    puts = SlowPuts(failing=twenty[3][1])
+    monkeypatch.setattr(obstore, "put", puts)
+    with pytest.raises(OSError, match="the store is away"):
+        store.put_files(twenty)
+    assert puts.under_way == 0
+    store.delete([key for _, key in twenty])
+    time.sleep(0.1)
     assert list(store.objects()) == []
 
 

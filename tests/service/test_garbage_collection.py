@@ -12,10 +12,11 @@ from service.database.connections import Database
 from service.database.tables import Blob, Project, new_id, now_us
 from service.domain.keys import create_project
 from service.settings import Settings
-from service.storage import blobs, garbage_collection
+from service.storage import blob_writer, blobs, garbage_collection
 from service.storage.artifacts import ArtifactStore
-from service.storage.blob_writer import store_file
+from service.storage.blob_writer import BlobWriter, store_file
 from service.storage.garbage_collection import collect_orphans, collect_unused
+from service.storage.spool import SpoolWriter
 from tests.helpers.live_api import Api, Client, wait_until
 from tests.helpers.tiny_drive import tiny_drive
 
@@ -140,3 +141,24 @@ def test_a_stored_file_says_whether_it_was_stored(
     first, second = store(), store()
     assert (first["is_new"], second["is_new"]) == (True, False)
     assert first["key"] == second["key"]
+
+
+def test_files_that_take_longer_than_the_grace_are_recorded(
+    database: Database,
+    artifacts: ArtifactStore,
+    database_settings: Settings,
+    project_id: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing refers to them yet, and they count as just used all the same."""
+    writer = SpoolWriter(database_settings.spool_dir, min_free_bytes=0)
+    with monkeypatch.context() as earlier:
+        earlier.setattr(blob_writer, "now_us", lambda: now_us() - _TWO_HOURS_US)
+        begun = BlobWriter(database, artifacts, project_id=project_id, durable=False)
+        stored = begun.store_all([writer.finish(b"bytes")])
+    with begun as store:
+        store.record(stored)
+        assert collect_unused(database, artifacts) == 0
+        store.used()
+    with database.read() as session:
+        assert session.scalars(select(Blob.key)).all() == [stored[0].key]

@@ -151,14 +151,11 @@ def _keep_all(
     context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
 ) -> StoredFiles:
     with BlobWriter(context.database, context.artifacts, project_id=project_id, durable=False) as store:
-        stored = [
-            (name, store(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes))
-            for name, spooled in unpacked
-        ]
+        stored = store.store_all([spooled for _, spooled in unpacked])
         # An archive may hold a hundred thousand files, and in SQLite all others who write wait for each transaction:
         # what takes long comes before the one that lets all files appear together.
-        recorded = store.record([file for _, file in stored])
-        blob_ids = {name: recorded[file.sha256].id for name, file in stored}
+        recorded = store.record(stored)
+        blob_ids = {name: recorded[spooled.sha256].id for name, spooled in unpacked}
 
         def fill(session: Session) -> None:
             drive = drives.get(session, project_id, drive_id, lock=True)
