@@ -260,14 +260,19 @@ def commit(
     return job
 
 
-def remove(session: Session, drive: Drive) -> None:
+def remove(session: Session, project_id: str, drive_id: str) -> None:
     """Delete a drive. Its scenes stay; bytes that nothing else needs are collected later.
 
     Raises
     ------
     ServiceError
-        409 where a job or a map needs it.
+        404 where the project has no such drive; 409 where a job or a map needs it.
     """
+    drive = get(session, project_id, drive_id)
+    # The check's job before the drive, as where a check ends: each would else hold what the other waits for.
+    checks = jobs.active_of_drive(drive.id).where(Job.kind == JobKind.PREFLIGHT).order_by(Job.id)
+    session.scalars(checks.with_for_update()).all()
+    drive = get(session, project_id, drive_id, lock=True)
     active = session.scalars(jobs.active_of_drive(drive.id)).all()
     # Sub-maps end with their reconstruction, or have nobody any more who waits for them.
     needing = [job.id for job in active if job.kind not in (JobKind.PREFLIGHT, JobKind.SUBMAP)]

@@ -342,7 +342,7 @@ def test_a_drive_is_deleted_while_its_last_sub_maps_end(
     running = claimed(database, submaps[0])
     cancel(database, parent.job_id)
     with database.write() as session:
-        drives.remove(session, drives.get(session, project_id, drive_id, lock=True))
+        drives.remove(session, project_id, drive_id)
     assert job_of(database, submaps[1]).state == JobState.CANCELLED
     with database.write() as session:
         assert jobs.cancel_requested(session, running)

@@ -130,8 +130,7 @@ def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, backgrou
 
     Bytes that nothing else needs leave the quota at once, or an hour after they were last used.
     """
-    with context.database.write() as session:
-        drives.remove(session, drives.get(session, caller.project_id, drive_id, lock=True))
+    context.database.transact(lambda session: drives.remove(session, caller.project_id, drive_id))
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 

@@ -141,8 +141,11 @@ def get_export(export_id: str, caller: CallerDep, context: ContextDep) -> Export
 )
 def delete_export(export_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete an export and its files. One that is being made is cancelled first, at its job."""
-    with context.database.write() as session:
+
+    def remove(session: Session) -> None:
         exports.remove(session, require(session, Export, caller.project_id, export_id, lock=True))
+
+    context.database.transact(remove)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 

@@ -148,8 +148,11 @@ async def put_file(
 )
 def delete_file(drive_id: str, path: str, caller: CallerDep, context: ContextDep) -> None:
     """Forget the bytes of one file of an open drive."""
-    with context.database.write() as session:
+
+    def forget(session: Session) -> None:
         drive_files.empty(session, drive_files.find(session, caller.project_id, drive_id, path, lock=True))
+
+    context.database.transact(forget)
 
 
 @router.put(

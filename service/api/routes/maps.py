@@ -48,10 +48,13 @@ def get_map(map_id: str, caller: CallerDep, context: ContextDep) -> MapResource:
 )
 def delete_map(map_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a map with all its versions. Its scenes and drives stay."""
-    with context.database.write() as session:
+
+    def remove(session: Session) -> None:
         found = maps.get(session, caller.project_id, map_id, lock=True)
         exports.require_none_active(session, what=f"map {map_id}", mine=Export.map_id == map_id)
         maps.remove(session, found)
+
+    context.database.transact(remove)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 
@@ -69,11 +72,14 @@ def set_current_version(
     body: Annotated[Body[CurrentVersion], Depends(read_current, scope="function")],
 ) -> MapResource:
     """Make another version the current one, for example to go back. The next aggregation goes on from it."""
-    with context.database.write() as session:
+
+    def choose(session: Session) -> MapResource:
         found = maps.get(session, caller.project_id, map_id, lock=True)
         maps.show_version(session, found, body.value.version)
         session.flush()
         return _shown(session, found)
+
+    return context.database.transact(choose)
 
 
 @router.get(
@@ -114,12 +120,15 @@ def delete_map_version(
     map_id: str, version: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks
 ) -> None:
     """Delete a version that is not the current one. Its scenes stay."""
-    with context.database.write() as session:
+
+    def remove(session: Session) -> None:
         found = maps.get(session, caller.project_id, map_id, lock=True)
         number = maps.version_of(session, found, version).number
         mine = (Export.map_id == map_id) & (Export.map_version == number)
         exports.require_none_active(session, what=f"version {number} of map {map_id}", mine=mine)
         maps.remove_version(session, found, version)
+
+    context.database.transact(remove)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 

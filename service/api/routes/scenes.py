@@ -54,11 +54,14 @@ def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneRes
 )
 def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
     """Delete a scene and its files. Its drive stays; what a map is made of cannot be deleted."""
-    with context.database.write() as session:
+
+    def remove(session: Session) -> None:
         require(session, Scene, caller.project_id, scene_id, lock=True)
         require_unused(session, what=f"scene {scene_id}", scene_id=scene_id)
         exports.require_none_active(session, what=f"scene {scene_id}", mine=Export.scene_id == scene_id)
         session.execute(delete(Scene).where(Scene.id == scene_id))
+
+    context.database.transact(remove)
     background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
 
 

@@ -88,8 +88,11 @@ def get_webhook(webhook_id: str, caller: CallerDep, context: ContextDep) -> Webh
 )
 def delete_webhook(webhook_id: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete a webhook and its messages, also those that were not sent."""
-    with context.database.write() as session:
+
+    def remove(session: Session) -> None:
         session.delete(require(session, Webhook, caller.project_id, webhook_id, lock=True))
+
+    context.database.transact(remove)
 
 
 @router.post(
