@@ -360,6 +360,10 @@ class JobOfTree(ServiceError, status=409):
     """The job is a part of another."""
 
 
+class RetryActive(ServiceError, status=409):
+    """The job is being done again."""
+
+
 class CheckActive(ServiceError, status=409):
     """The drive has its check."""
 
@@ -483,6 +487,15 @@ def store_unavailable() -> StoreUnavailable:
         remedy="Repeat it in some seconds; if it fails again, tell the operator.",
         headers={"Retry-After": "5"},
     )
+
+
+def drive_rejected(drive_id: str, findings: Sequence[Finding]) -> DriveRejected:
+    """Make the error of a drive whose check found errors; its detail names the first."""
+    errors = [finding for finding in findings if finding.severity == "error"]
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    what = errors[0].what if errors else "its check found that it cannot be reconstructed"
+    remedy = errors[0].remedy if errors else "Correct the drive, and upload it as a new one."
+    return DriveRejected(f"drive {drive_id}: {what}{more}", remedy=remedy, findings=findings)
 
 
 def not_found(what: str, name: str) -> NotFound:

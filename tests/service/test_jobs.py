@@ -6,6 +6,7 @@ import json
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import httpx
@@ -185,6 +186,42 @@ def test_a_job_whose_drive_is_gone_is_not_retried(owner: Client) -> None:
     owner.post(f"/v1/jobs/{job['id']}:cancel")
     owner.delete(f"/v1/drives/{drive_id}")
     problem_of(owner.post(f"/v1/jobs/{job['id']}:retry"), 409, "drive-deleted")
+
+
+def test_a_job_is_retried_once_at_a_time(owner: Client, job: dict[str, Any]) -> None:
+    """Also by the retry of a retry; a request that is repeated under its key gets the retry that it made."""
+    url = f"/v1/jobs/{job['id']}:retry"
+    fail(owner, owner.claim(job["id"]))
+    first = owner.post(url, headers={"Idempotency-Key": "again"}).json()
+    assert first["id"] in problem_of(owner.post(url), 409, "retry-active")["detail"]
+    assert owner.post(url, headers={"Idempotency-Key": "again"}).json() == first
+    fail(owner, owner.claim(first["id"]))
+    second = owner.post(f"/v1/jobs/{first['id']}:retry").json()
+    assert second["id"] in problem_of(owner.post(url), 409, "retry-active")["detail"]
+    owner.post(f"/v1/jobs/{second['id']}:cancel")
+    assert owner.post(url).json()["retry_of"] == job["id"]
+
+
+def test_retries_at_one_time_make_one_job(api: Api, owner: Client, job: dict[str, Any]) -> None:
+    fail(owner, owner.claim(job["id"]))
+    clients = [api.client_of(owner.project_id, owner.key) for _ in range(4)]
+    with ThreadPoolExecutor(len(clients)) as pool:
+        answers = list(pool.map(lambda client: client.post(f"/v1/jobs/{job['id']}:retry"), clients))
+    assert sorted(answer.status_code for answer in answers) == [202, 409, 409, 409]
+
+
+def test_a_job_of_a_rejected_drive_is_not_retried(api: Api, owner: Client) -> None:
+    drive_id = owner.committed()
+    job = owner.reconstruct(drive_id)
+    owner.post(f"/v1/jobs/{job['id']}:cancel")
+    held = owner.claim(check_of(owner, drive_id)["preflight_job_id"])
+    finding = {"severity": "error", "code": "blurred", "what": "all is blurred", "remedy": "Drive by day."}
+    with api.database.write() as session:
+        jobs.record_findings(session, held, [finding], sound=False)
+    asked_anew = owner.post("/v1/reconstructions", json={"drive_id": drive_id})
+    problem = problem_of(owner.post(f"/v1/jobs/{job['id']}:retry"), 422, "drive-rejected")
+    assert problem["findings"] == problem_of(asked_anew, 422, "drive-rejected")["findings"] == [finding]
+    assert "all is blurred" in problem["detail"]
 
 
 def test_a_retried_job_is_kept_as_long_as_a_new_one(start_api: StartApi) -> None:

@@ -26,7 +26,7 @@ from service.domain import drives
 from service.domain.drives import Stored
 from service.domain.idempotency import Answer
 from service.domain.manifest_facts import ManifestFacts
-from service.errors import DriveRejected, ServiceError
+from service.errors import drive_rejected
 from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.durability import secure_drive
 from service.storage.garbage_collection import collect_unused
@@ -164,7 +164,7 @@ async def commit_drive(drive_id: str, once: IdempotentDep, caller: CallerDep, co
         drive = drives.get(session, caller.project_id, drive_id, lock=True)
         if any(finding.severity == "error" for finding in found):
             drives.require_complete(session, drive)  # what is missing is said first; bytes may prove to be lost
-            raise rejected(drive_id, found)
+            raise drive_rejected(drive_id, found)
         job = drives.commit(
             session,
             drive,
@@ -190,13 +190,6 @@ def get_preflight(drive_id: str, caller: CallerDep, context: ContextDep) -> Pref
         job_id=drive.preflight_job_id,
         findings=[Finding.model_validate(finding) for finding in drive.findings],
     )
-
-
-def rejected(drive_id: str, findings: list[Finding]) -> ServiceError:
-    """422: the check of the drive found errors."""
-    errors = [finding for finding in findings if finding.severity == "error"]
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    return DriveRejected(f"drive {drive_id}: {errors[0].what}{more}", remedy=errors[0].remedy, findings=findings)
 
 
 def _shown(session: Session, drive: Drive) -> DriveResource:

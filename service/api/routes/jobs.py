@@ -148,6 +148,7 @@ def cancel_job(
 def retry_job(job_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep) -> Response:
     """Do again what failed or was cancelled, as a new job. Finished stages are reused.
 
+    One retry of a job is active at a time: another one is refused with the active job's id.
     A sub-map is not retried alone: the retry of its reconstruction maps those again that are not finished.
     """
 

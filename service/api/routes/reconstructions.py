@@ -7,15 +7,13 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response
 from sqlalchemy.orm import Session
 
-from schemas.api.drives import DriveState, PreflightState
+from schemas.api.drives import DriveState
 from schemas.api.jobs import JobKind, JobResource, ReconstructionRequest
-from schemas.api.resource import Finding
 from service.api.dependencies import CallerDep, ContextDep, IdempotentDep, expiry_us
 from service.api.http.body_reading import json_body
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import problems
 from service.api.routes.aggregations import ACCEPTED, accepted
-from service.api.routes.drives import rejected
 from service.database.tables import now_us
 from service.domain import drives, jobs
 from service.domain.idempotency import Answer
@@ -54,8 +52,7 @@ def create_reconstruction(
                 f"drive {drive.id} still takes files",
                 remedy=f"Upload what is missing, then POST /v1/drives/{drive.id}:commit.",
             )
-        if drive.preflight_state == PreflightState.REJECTED:
-            raise rejected(drive.id, [Finding.model_validate(finding) for finding in drive.findings])
+        jobs.require_not_rejected(drive)
         job = jobs.create(
             session,
             project_id=caller.project_id,

@@ -33,6 +33,7 @@ from service.domain.jobs._requests import (
     create,
     request_cancel,
     require_failed,
+    require_not_rejected,
     require_places,
     retry,
 )
@@ -77,6 +78,7 @@ __all__ = [
     "release",
     "request_cancel",
     "require_failed",
+    "require_not_rejected",
     "require_places",
     "retry",
     "submaps_of",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, TypedDict, Unpack
 
 from sqlalchemy import func, or_, select, update
@@ -10,12 +10,23 @@ from sqlalchemy.orm import Session
 
 from schemas.api.drives import PreflightState
 from schemas.api.jobs import JobKind
+from schemas.api.resource import Finding
 from service.database.connections import clock_us
 from service.database.tables import Drive, Job, JobState, Project, new_id
 from service.domain.jobs._completion import after_end
 from service.domain.jobs._dependencies import orphans
 from service.domain.jobs._queries import ACTIVE, active_of_drive, change, close_attempts, locked, tell_state
-from service.errors import CheckActive, DriveDeleted, JobEnded, JobNotFailed, JobOfTree, QuotaFull, TooManyJobs
+from service.errors import (
+    CheckActive,
+    DriveDeleted,
+    JobEnded,
+    JobNotFailed,
+    JobOfTree,
+    QuotaFull,
+    RetryActive,
+    TooManyJobs,
+    drive_rejected,
+)
 
 # A drive's check is part of committing it, and a sub-map of its reconstruction.
 _UNCOUNTED = (JobKind.PREFLIGHT, JobKind.SUBMAP)
@@ -152,8 +163,8 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     Raises
     ------
     ServiceError
-        409 where the job has not ended, has succeeded, is a sub-map's, its drive was deleted or needs no other
-        check; 413 and 429 as `create`.
+        409 where the job has not ended, has succeeded, is a sub-map's, is being done again already, its drive was
+        deleted or needs no other check; 422 where the drive was rejected; 413 and 429 as `create`.
     """
     require_failed(job)
     if job.parent_id is not None:
@@ -170,6 +181,9 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
     kind = JobKind(job.kind)
     if kind is JobKind.PREFLIGHT:
         _require_unchecked(session, drive)
+    else:
+        require_not_rejected(drive)
+        _require_not_retried(session, job)
     new = create(
         session,
         project_id=job.project_id,
@@ -183,6 +197,36 @@ def retry(session: Session, job: Job, *, expires_us: int | None) -> Job:
         values = {"preflight_job_id": new.id, "preflight_state": PreflightState.PENDING}
         session.execute(update(Drive).where(Drive.id == job.drive_id).values(**values))
     return new
+
+
+def require_not_rejected(drive: Drive) -> None:
+    """Refuse to reconstruct a drive whose check found errors.
+
+    Raises
+    ------
+    ServiceError
+        422 with the findings.
+    """
+    if drive.preflight_state == PreflightState.REJECTED:
+        raise drive_rejected(drive.id, [Finding.model_validate(finding) for finding in drive.findings])
+
+
+def _require_not_retried(session: Session, job: Job) -> None:
+    """Refuse to do a job's hours of work twice at one time. The caller has locked the drive, as other retries do."""
+    for active in session.scalars(active_of_drive(job.drive_id or "").where(Job.retry_of.is_not(None))):
+        if job.id in _retried_by(session, active):
+            raise RetryActive(
+                f"job {job.id} is being done again already, by job {active.id}",
+                remedy=f"Look at that job, GET /v1/jobs/{active.id}, or cancel it first.",
+            )
+
+
+def _retried_by(session: Session, job: Job) -> Iterator[str]:
+    """The job that this one is a retry of, and in turn what that one is a retry of."""
+    retry_of = job.retry_of
+    while retry_of is not None:
+        yield retry_of
+        retry_of = session.scalar(select(Job.retry_of).where(Job.id == retry_of))
 
 
 def require_failed(job: Job) -> None:
