@@ -108,8 +108,20 @@ def get(session: Session, project_id: str, drive_id: str, *, lock: bool = False)
     return require(session, Drive, project_id, drive_id, lock=lock)
 
 
-def stored_of(session: Session, drive_ids: Sequence[str]) -> dict[str, Stored]:
-    """Count the stored files of each drive."""
+def stored_of(session: Session, found: Sequence[Drive]) -> dict[str, Stored]:
+    """Number and size of the stored files of each drive, by its id. Only those of open drives are counted."""
+    stored = {
+        drive.id: Stored(drive.files_stored, drive.bytes_stored)
+        for drive in found
+        if drive.files_stored is not None and drive.bytes_stored is not None
+    }
+    counted = _count(session, [drive.id for drive in found if drive.id not in stored])
+    return {drive.id: stored.get(drive.id) or counted[drive.id] for drive in found}
+
+
+def _count(session: Session, drive_ids: Sequence[str]) -> dict[str, Stored]:
+    if not drive_ids:
+        return {}
     statement = select(DriveFile.drive_id, func.count(), func.coalesce(func.sum(Blob.size_bytes), 0)).join(
         Blob, DriveFile.blob_id == Blob.id
     )
@@ -253,6 +265,8 @@ def commit(
         drive_id=drive.id,
         expires_us=job_expires_us,
     )
+    stored = _count(session, [drive.id])[drive.id]
+    drive.files_stored, drive.bytes_stored = stored.files, stored.size_bytes
     drive.state, drive.committed_us = DriveState.COMMITTED, now_us()
     drive.findings = list(findings)
     drive.preflight_state, drive.preflight_job_id = PreflightState.PENDING, job.id

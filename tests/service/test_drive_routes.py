@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -14,7 +15,7 @@ import pytest
 from schemas.api.resource import Finding
 from service.api.manifests import manifest_check
 from service.database.tables import Blob, Drive
-from service.domain import jobs
+from service.domain import drives, jobs
 from tests.helpers.live_api import Api, Client, problem_of, wait_until
 from tests.helpers.tiny_drive import TinyDrive, manifest, tiny_drive
 from tests.service.conftest import StartApi
@@ -191,6 +192,26 @@ def test_a_commit_while_files_come_takes_all_or_refuses(client: Client) -> None:
     assert commits[-1] == 200
     assert set(commits[:-1]) <= {409}
     assert client.get(f"/v1/drives/{drive_id}").json()["files_stored"] == 6
+
+
+def test_a_committed_drive_is_shown_without_its_files_being_counted(api: Api, client: Client) -> None:
+    sent = [tiny_drive("short", frames=3, seed="short"), tiny_drive("long", frames=100, seed="long")]
+    drive_ids = [client.frozen(drive) for drive in sent]
+    steps: list[int] = []
+    with api.database.read() as session:
+        database = session.connection().connection.driver_connection
+        assert isinstance(database, sqlite3.Connection)
+        for drive_id in drive_ids:
+            done: list[None] = []
+            database.set_progress_handler(lambda done=done: done.append(None), 1)  # type: ignore[misc]
+            drives.stored_of(session, [drives.get(session, client.project_id, drive_id)])
+            database.set_progress_handler(None, 0)
+            steps.append(len(done))
+    assert steps[0] == steps[1] > 0
+    shown = {drive["id"]: drive for drive in client.get("/v1/drives").json()["items"]}
+    for drive_id, drive in zip(drive_ids, sent, strict=True):
+        size_bytes = sum(len(data) for data in drive.files.values())
+        assert (shown[drive_id]["files_stored"], shown[drive_id]["bytes_stored"]) == (len(drive.files), size_bytes)
 
 
 def test_what_the_check_of_the_images_finds_is_shown(client: Client) -> None:

@@ -28,6 +28,7 @@ from service.database.tables import (
     WebhookDelivery,
 )
 from service.domain import webhooks
+from service.domain.drives import Stored, stored_of
 from service.settings import Settings
 from tests.helpers.live_api import REPOSITORY, free_port
 
@@ -122,6 +123,34 @@ def test_records_of_sessions_exports_and_webhooks_stay(database_settings: Settin
         webhooks.note(session, message, webhooks.Outcome(status=204))
         assert session.query(WebhookDelivery).one().state == "DELIVERED"
     database.close()
+
+
+def test_files_of_committed_drives_are_counted(database_settings: Settings) -> None:
+    database = _migrated_with(database_settings, "0010", _DRIVES_WITH_FILES)
+    with database.read() as session:
+        found = {drive.id: (drive.files_stored, drive.bytes_stored) for drive in session.query(Drive)}
+        assert found == {"drv_1": (2, 30), "drv_2": (None, None), "drv_3": (0, 0)}
+        drives = session.query(Drive).order_by(Drive.id).all()
+        stored = stored_of(session, drives)
+        assert [stored[drive.id] for drive in drives] == [Stored(2, 30), Stored(1, 10), Stored(0, 0)]
+    database.close()
+
+
+_DRIVES_WITH_FILES = (
+    "INSERT INTO projects (id, name, used_bytes, max_bytes, max_active_jobs, max_drives, created_us) "
+    "VALUES ('prj_1', 'p', 0, 1, 1, 1, 1)",
+    "INSERT INTO blobs (id, project_id, key, sha256, size_bytes, touched_us) "
+    "VALUES ('blb_1', 'prj_1', 'k', 's', 10, 1), ('blb_2', 'prj_1', 'l', 't', 20, 1)",
+    *(
+        "INSERT INTO drives (id, project_id, name, state, manifest_blob_id, cameras, frames, files_expected, has_gnss, "
+        "preflight_state, findings, created_us) VALUES "
+        f"('{drive_id}', 'prj_1', 'd', '{state}', 'blb_1', 1, 2, 2, false, 'NONE', '[]', 1)"
+        for drive_id, state in (("drv_1", "COMMITTED"), ("drv_2", "OPEN"), ("drv_3", "COMMITTED"))
+    ),
+    "INSERT INTO drive_files (drive_id, path, role, blob_id, stored_us) VALUES "
+    "('drv_1', 'a', 'image', 'blb_1', 1), ('drv_1', 'b', 'image', 'blb_2', 1), "
+    "('drv_2', 'a', 'image', 'blb_1', 1), ('drv_2', 'b', 'image', NULL, NULL)",
+)
 
 
 _LATER_RECORDS = (

@@ -94,7 +94,7 @@ def list_drives(
     """Drives of the project, newest first."""
     with context.database.read() as session:
         found, following = newest(session, Drive, caller.project_id, cursor=cursor, limit=limit, vehicle=vehicle)
-        stored = drives.stored_of(session, [drive.id for drive in found])
+        stored = drives.stored_of(session, found)
     return Page(items=[shown(drive, stored[drive.id]) for drive in found], next=following)
 
 
@@ -193,7 +193,7 @@ def get_preflight(drive_id: str, caller: CallerDep, context: ContextDep) -> Pref
 
 
 def _shown(session: Session, drive: Drive) -> DriveResource:
-    return shown(drive, drives.stored_of(session, [drive.id])[drive.id])
+    return shown(drive, drives.stored_of(session, [drive])[drive.id])
 
 
 def shown(drive: Drive, stored: Stored) -> DriveResource:

@@ -64,7 +64,7 @@ def require_room(context: Context, project_id: str, drive_id: str, size_bytes: i
         drive = drives.get(session, project_id, drive_id)
         drives.require_open(drive)
         project = session.get_one(Project, project_id)
-        there = drives.stored_of(session, [drive_id])[drive_id]
+        there = drives.stored_of(session, [drive])[drive_id]
     left_bytes = max(0, project.max_bytes - project.used_bytes) + there.size_bytes
     left_bytes += _ENTRY_BYTES * (drive.files_expected + 1)
     if size_bytes is not None and left_bytes < size_bytes <= bound:
@@ -165,7 +165,7 @@ def _keep_all(
         store.used()
     with context.database.read() as session:
         drive = drives.get(session, project_id, drive_id)
-        count = drives.stored_of(session, [drive_id])[drive_id].files
+        count = drives.stored_of(session, [drive])[drive_id].files
     return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
 
 

@@ -29,6 +29,8 @@ class Drive(Base):
     cameras: Mapped[int]
     frames: Mapped[int]
     files_expected: Mapped[int]
+    files_stored: Mapped[int | None]  # None as long as they change
+    bytes_stored: Mapped[int | None]
     has_gnss: Mapped[bool]
     preflight_state: Mapped[str] = mapped_column(String(16), default=PreflightState.NONE)
     findings: Mapped[list[Any]] = mapped_column(default=list)
