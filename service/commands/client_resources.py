@@ -218,12 +218,11 @@ def _export(conversation: Conversation, summary: Summary) -> int:
         raise _unknown(f"{arguments.id} is no scene or map")
     conversation.say(f"export {export.id}: {client.url}/v1/exports/{export.id}")
     if arguments.out is not None:
-        job = client.job(export.job_id)
-        if export.state != JobState.SUCCEEDED:
-            job = conversation.wait(job)
+        if export.state != JobState.SUCCEEDED:  # the record of an older job may have expired
+            job = conversation.wait(client.job(export.job_id))
             export = client.export(export.id)
-        if export.state != JobState.SUCCEEDED:
-            return conversation.job_failed(job)
+            if export.state != JobState.SUCCEEDED:
+                return conversation.job_failed(job)
         _say_withheld(conversation, export)
         conversation.download(export)
     summary.items.append(export.model_dump(mode="json"))

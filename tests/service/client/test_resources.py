@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import delete
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobState
@@ -19,6 +20,7 @@ from schemas.api.webhooks import WebhookEvent, WebhookRequest
 from service.client import ApiError, AsyncClient, Client, ClientError, download, watch_job
 from service.client import api as client_api
 from service.commands.client_program import main
+from service.database.tables import Job
 from service.domain import exports
 from tests.helpers.live_api import SCENE_FILES
 from tests.helpers.live_api import Client as Owner
@@ -140,6 +142,20 @@ def run(client: Owner, capsys: pytest.CaptureFixture[str], *words: str) -> tuple
     code = main([*words, "--url", client.api.url, "--json"])
     told: dict[str, Any] = json.loads(capsys.readouterr().out)
     return code, told
+
+
+def test_an_export_outlives_the_record_of_its_job(
+    client: Owner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("MRASFM_API_KEY", client.key)
+    scene_id = client.scene({**SCENE_FILES, "report.json": b"{}"})
+    (export,) = run(client, capsys, "export", scene_id, "--format", "kitti")[1]["items"]
+    publish(client, export["job_id"])
+    with client.api.database.write() as session:
+        session.execute(delete(Job).where(Job.id == export["job_id"]))
+    code, told = run(client, capsys, "export", scene_id, "--format", "kitti", "--out", str(tmp_path / "out"))
+    assert (code, [item["id"] for item in told["items"]]) == (0, [export["id"]])
+    assert (tmp_path / "out" / "report.json").read_bytes() == FILES["report.json"]
 
 
 def test_commands(
