@@ -410,6 +410,10 @@ class TooManyStreams(ServiceError, status=429):
     """The project has as many event streams open as it may."""
 
 
+class TooManySecrets(ServiceError, status=409):
+    """The webhook's secret was replaced too often."""
+
+
 class DeliveryPending(ServiceError, status=409):
     """The message is pending."""
 

@@ -19,21 +19,22 @@ from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, func, select, update
+from sqlalchemy import ColumnElement, Select, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import DeliveryState, WebhookEvent, WebhookRequest
 from service.database.connections import clock_us
-from service.database.tables import Job, JobState, Project, Webhook, WebhookDelivery, now_us
+from service.database.tables import Job, JobState, Project, Webhook, WebhookDelivery, WebhookOldSecret
 from service.domain.webhook_addresses import require_url
-from service.errors import DeliveryPending, TooManyWebhooks, not_found
+from service.errors import DeliveryPending, TooManySecrets, TooManyWebhooks, not_found
 
 MAX_OF_PROJECT = 20
 MAX_PENDING = 10_000  # messages of one webhook: what does not answer for days shall not fill the database
 SECRET_PREFIX = "whsec_"
 _SECRET_BYTES = 32
 ROTATION_US = 24 * 3600 * 1_000_000  # how long the secret before signs as well
+MAX_OLD_SECRETS = 8  # of a webhook, that sign beside its own
 TAKEN_US = 45 * 1_000_000  # how long a message is one sender's, who gives up earlier
 KEPT_US = 30 * 24 * 3600 * 1_000_000  # how long a message is listed after its end
 # Seconds from one try to the next, as Standard Webhooks proposes; after the last it is given up: 75 hours in all.
@@ -105,16 +106,43 @@ def new_secret() -> str:
     return SECRET_PREFIX + base64.b64encode(secrets.token_bytes(_SECRET_BYTES)).decode("ascii")
 
 
-def rotate(webhook: Webhook) -> None:
-    """Give a webhook another secret; the one before signs as well for a day."""
-    webhook.previous_secret, webhook.previous_until_us = webhook.secret, now_us() + ROTATION_US
+def rotate(session: Session, webhook: Webhook) -> None:
+    """Give a webhook, which the caller has locked, another secret; the one before signs as well for a day.
+
+    Raises
+    ------
+    ServiceError
+        409 where as many old ones sign as may: each makes every message longer.
+    """
+    now = clock_us(session)
+    old = session.scalars(_signing(now).where(WebhookOldSecret.webhook_id == webhook.id)).all()
+    if len(old) >= MAX_OLD_SECRETS:
+        wait_s = (old[-1].until_us - now) // 1_000_000 + 1
+        raise TooManySecrets(
+            f"{len(old)} secrets of webhook {webhook.id} were replaced within a day, and sign still",
+            remedy=f"Rotate it in {wait_s} s, or register another webhook in its place.",
+            headers={"Retry-After": str(wait_s)},
+        )
+    session.add(WebhookOldSecret(webhook_id=webhook.id, secret=webhook.secret, until_us=now + ROTATION_US))
     webhook.secret = new_secret()
+
+
+def _signing(now: int) -> Select[WebhookOldSecret]:
+    """Old secrets that sign still, the one that was replaced last first."""
+    return select(WebhookOldSecret).where(WebhookOldSecret.until_us > now).order_by(WebhookOldSecret.until_us.desc())
+
+
+def old_secrets_until(session: Session, found: Sequence[Webhook]) -> dict[str, int]:
+    """Time at which the last old secret of a webhook signs no more, by the ids of those that have some."""
+    signing = WebhookOldSecret.webhook_id.in_([webhook.id for webhook in found])
+    until = select(WebhookOldSecret.webhook_id, func.max(WebhookOldSecret.until_us)).where(signing)
+    until = until.where(WebhookOldSecret.until_us > clock_us(session)).group_by(WebhookOldSecret.webhook_id)
+    return {webhook_id: int(until_us) for webhook_id, until_us in session.execute(until)}
 
 
 def forget_old_secrets(session: Session) -> None:
     """Delete secrets that sign no more."""
-    over = Webhook.previous_until_us <= clock_us(session)
-    session.execute(update(Webhook).where(over).values(previous_secret=None, previous_until_us=None))
+    session.execute(delete(WebhookOldSecret).where(WebhookOldSecret.until_us <= clock_us(session)))
 
 
 def record(session: Session, job: Job) -> None:
@@ -234,18 +262,18 @@ def _take_first(session: Session, webhook_id: str, now: int) -> Message | None:
         project_id=webhook.project_id,
         url=webhook.url,
         body=delivery.body,
-        secrets=_secrets(webhook, now),
+        secrets=_secrets(session, webhook, now),
         attempts=delivery.attempts,
     )
 
 
-def _secrets(webhook: Webhook, now: int) -> list[str]:
-    previous = webhook.previous_secret if now < (webhook.previous_until_us or 0) else None
-    return [webhook.secret, *([] if previous is None else [previous])]
+def _secrets(session: Session, webhook: Webhook, now: int) -> list[str]:
+    old = session.scalars(_signing(now).where(WebhookOldSecret.webhook_id == webhook.id))
+    return [webhook.secret, *(replaced.secret for replaced in old)]
 
 
 def signed_headers(message: Message, *, timestamp_s: int) -> dict[str, str]:
-    """Headers of a message as Standard Webhooks has them: with two secrets, two signatures."""
+    """Headers of a message as Standard Webhooks has them: with several secrets, as many signatures."""
     content = f"{message.id}.{timestamp_s}.{message.body}".encode()
     signatures = [
         base64.b64encode(

@@ -203,7 +203,7 @@ def test_a_committed_drive_is_shown_without_its_files_being_counted(api: Api, cl
         assert isinstance(database, sqlite3.Connection)
         for drive_id in drive_ids:
             done: list[None] = []
-            database.set_progress_handler(lambda done=done: done.append(None), 1)  # type: ignore[misc]
+            database.set_progress_handler(lambda done=done: done.append(None), 1)
             drives.stored_of(session, [drives.get(session, client.project_id, drive_id)])
             database.set_progress_handler(None, 0)
             steps.append(len(done))

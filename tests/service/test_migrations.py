@@ -119,7 +119,7 @@ def test_records_of_sessions_exports_and_webhooks_stay(database_settings: Settin
         export = session.query(Export).one()
         assert (export.formats, export.options, export.results) == (["kitti"], {"crs": None}, None)
         (message,) = webhooks.take(session, limit=8)
-        assert (message.id, message.secrets) == ("msg_1", ["whsec_AA=="])
+        assert (message.id, message.secrets) == ("msg_1", ["whsec_AA==", "whsec_BB=="])
         webhooks.note(session, message, webhooks.Outcome(status=204))
         assert session.query(WebhookDelivery).one().state == "DELIVERED"
     database.close()
@@ -161,8 +161,9 @@ _LATER_RECORDS = (
     "VALUES ('ses_1', 'key_1', 's', 1, 9007199254740992)",
     "INSERT INTO exports (id, project_id, job_id, inputs_sha256, formats, options, created_us) "
     "VALUES ('exp_1', 'prj_1', 'job_1', 's', '[\"kitti\"]', '{\"crs\": null}', 1)",
-    "INSERT INTO webhooks (id, project_id, url, events, description, secret, created_us) "
-    "VALUES ('whk_1', 'prj_1', 'https://example.org/', '[\"job.failed\"]', '', 'whsec_AA==', 1)",
+    "INSERT INTO webhooks (id, project_id, url, events, description, secret, previous_secret, previous_until_us, "
+    "created_us) VALUES ('whk_1', 'prj_1', 'https://example.org/', '[\"job.failed\"]', '', 'whsec_AA==', 'whsec_BB==', "
+    "9007199254740992, 1)",
     "INSERT INTO webhook_deliveries (id, webhook_id, job_id, event, body, state, attempts, next_us, created_us) "
     "VALUES ('msg_1', 'whk_1', 'job_1', 'job.failed', '{}', 'PENDING', 3, 1, 1)",
 )

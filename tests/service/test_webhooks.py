@@ -9,13 +9,13 @@ import threading
 from typing import Any
 
 import pytest
-from sqlalchemy import false
+from sqlalchemy import false, update
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
 from schemas.api.webhooks import WebhookRequest
 from service.database.connections import Database
-from service.database.tables import Export, Job, Scene, Webhook, WebhookDelivery, now_us
+from service.database.tables import Export, Job, Scene, Webhook, WebhookDelivery, WebhookOldSecret, now_us
 from service.domain import exports, jobs, maps, webhooks
 from service.domain.keys import create_project
 from service.domain.webhook_addresses import is_public
@@ -89,27 +89,60 @@ def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
     assert messages(client, made["id"]) == []
 
 
-def test_rotating_keeps_the_secret_before_for_a_day(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+def secrets_of_message(client: Client, webhook_id: str) -> list[str]:
+    """The secrets that sign a message now."""
+    client.post(f"/v1/jobs/{client.reconstruct(client.committed())['id']}:cancel")
+    with client.api.database.write() as session:
+        (taken,) = [message for message in webhooks.take(session, limit=100) if message.webhook_id == webhook_id]
+        webhooks.note(session, taken, webhooks.Outcome(status=204))
+    assert len(webhooks.signed_headers(taken, timestamp_s=1)["webhook-signature"].split(" ")) == len(taken.secrets)
+    return list(taken.secrets)
+
+
+def test_rotating_keeps_the_secret_before_for_a_day(client: Client) -> None:
     made = register(client)
     rotated = client.post(f"/v1/webhooks/{made['id']}:rotate").json()
     assert rotated["secret"] != made["secret"]
     assert rotated["previous_secret_until"] is not None
-    client.post(f"/v1/jobs/{client.reconstruct(client.committed())['id']}:cancel")
-    with client.api.database.write() as session:
-        taken = [m for m in webhooks.take(session, limit=100) if m.webhook_id == made["id"]]
-    assert taken[0].secrets == [rotated["secret"], made["secret"]]
-    headers = webhooks.signed_headers(taken[0], timestamp_s=1)
-    assert len(headers["webhook-signature"].split(" ")) == 2
+    assert secrets_of_message(client, made["id"]) == [rotated["secret"], made["secret"]]
+    age_secrets(client, made["id"], webhooks.ROTATION_US)
+    assert secrets_of_message(client, made["id"]) == [rotated["secret"]]
+    assert client.get(f"/v1/webhooks/{made['id']}").json()["previous_secret_until"] is None
     with client.api.database.write() as session:
         webhooks.forget_old_secrets(session)
-        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
-        assert webhook.previous_secret == made["secret"]
-        webhook.previous_until_us = now_us() - 1
+        assert session.query(WebhookOldSecret).filter_by(webhook_id=made["id"]).count() == 0
+
+
+def age_secrets(client: Client, webhook_id: str, by_us: int) -> None:
+    """Let the time pass in which old secrets sign."""
+    with client.api.database.write() as session:
+        older = update(WebhookOldSecret).where(WebhookOldSecret.webhook_id == webhook_id)
+        session.execute(older.values(until_us=WebhookOldSecret.until_us - by_us))
+
+
+def test_rotating_again_leaves_each_secret_its_day(client: Client) -> None:
+    """A receiver that has the first secret is not cut off by the second rotation."""
+    made = register(client)
+    url = f"/v1/webhooks/{made['id']}:rotate"
+    first = client.post(url).json()["secret"]
+    age_secrets(client, made["id"], webhooks.ROTATION_US // 2)
+    second = client.post(url).json()
+    assert secrets_of_message(client, made["id"]) == [second["secret"], first, made["secret"]]
+    shown = client.get("/v1/webhooks").json()["items"][0]
+    assert shown["previous_secret_until"] == second["previous_secret_until"]
+    age_secrets(client, made["id"], webhooks.ROTATION_US // 2)
     with client.api.database.write() as session:
         webhooks.forget_old_secrets(session)
-        webhook = session.get_one(Webhook, made["id"], populate_existing=True)
-        assert (webhook.previous_secret, webhook.previous_until_us) == (None, None)
-        assert webhook.secret == rotated["secret"]
+    assert secrets_of_message(client, made["id"]) == [second["secret"], first]
+
+
+def test_secrets_that_sign_are_bounded(client: Client) -> None:
+    url = f"/v1/webhooks/{register(client)['id']}:rotate"
+    for _ in range(webhooks.MAX_OLD_SECRETS):
+        assert client.post(url).status_code == 200
+    refused = client.post(url)
+    problem_of(refused, 409, "too-many-secrets")
+    assert 0 < int(refused.headers["retry-after"]) <= webhooks.ROTATION_US // 1_000_000 + 1
 
 
 def test_the_signature_is_that_of_standard_webhooks() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Response
@@ -21,7 +22,7 @@ from service.api.http.body_reading import json_body
 from service.api.http.paging import newest, page_of
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import gives, problems
-from service.database.tables import Webhook, WebhookDelivery, now_us
+from service.database.tables import Webhook, WebhookDelivery
 from service.domain import webhooks
 from service.domain.access import require
 from service.domain.idempotency import Answer
@@ -58,7 +59,7 @@ def create_webhook(
             asked=body.value,
             allow_private=context.settings.webhook_private_addresses,
         )
-        return answer(201, _with_secret(webhook), Location=f"/v1/webhooks/{webhook.id}")
+        return answer(201, _with_secret(session, webhook), Location=f"/v1/webhooks/{webhook.id}")
 
     return once(effect, body.raw)
 
@@ -70,14 +71,16 @@ def list_webhooks(
     """Webhooks of the project, newest first, without their secrets."""
     with context.database.read() as session:
         found, following = newest(session, Webhook, caller.project_id, cursor=cursor, limit=limit)
-    return Page(items=[WebhookResource.model_validate(_fields(webhook)) for webhook in found], next=following)
+        items = [WebhookResource.model_validate(fields) for fields in _fields(session, found)]
+    return Page(items=items, next=following)
 
 
 @router.get("/{webhook_id}", summary="Show a webhook", responses={**gives(200, "The webhook"), **problems(401, 404)})
 def get_webhook(webhook_id: str, caller: CallerDep, context: ContextDep) -> WebhookResource:
     """One webhook, without its secret."""
     with context.database.read() as session:
-        return WebhookResource.model_validate(_fields(require(session, Webhook, caller.project_id, webhook_id)))
+        (fields,) = _fields(session, [require(session, Webhook, caller.project_id, webhook_id)])
+    return WebhookResource.model_validate(fields)
 
 
 @router.delete(
@@ -102,13 +105,16 @@ def delete_webhook(webhook_id: str, caller: CallerDep, context: ContextDep) -> N
     responses={**gives(200, "The webhook with its new secret"), **problems(401, 404, 409, 422)},
 )
 def rotate_webhook(webhook_id: str, once: IdempotentDep, caller: CallerDep, context: ContextDep) -> Response:
-    """Give a webhook another secret. For a day messages have two signatures, of the secret before as well."""
+    """Give a webhook another secret. For a day messages have a signature of the secret before as well.
+
+    Each rotation is good for a day of its own, also where others follow.
+    """
 
     def effect(session: Session) -> Answer:
         webhook = require(session, Webhook, caller.project_id, webhook_id, lock=True)
-        webhooks.rotate(webhook)
+        webhooks.rotate(session, webhook)
         session.flush()
-        return answer(200, _with_secret(webhook))
+        return answer(200, _with_secret(session, webhook))
 
     return once(effect)
 
@@ -149,21 +155,25 @@ def retry_delivery(
     return once(effect)
 
 
-def _with_secret(webhook: Webhook) -> WebhookWithSecret:
-    return WebhookWithSecret.model_validate({**_fields(webhook), "secret": webhook.secret})
+def _with_secret(session: Session, webhook: Webhook) -> WebhookWithSecret:
+    (fields,) = _fields(session, [webhook])
+    return WebhookWithSecret.model_validate({**fields, "secret": webhook.secret})
 
 
-def _fields(webhook: Webhook) -> dict[str, Any]:
-    until_us = webhook.previous_until_us
-    return {
-        "id": webhook.id,
-        "url": webhook.url,
-        "events": webhook.events,
-        "description": webhook.description,
-        "disabled": webhook.disabled_us is not None,
-        "previous_secret_until": moment(until_us) if until_us is not None and until_us > now_us() else None,
-        "created_at": moment(webhook.created_us),
-    }
+def _fields(session: Session, found: Sequence[Webhook]) -> list[dict[str, Any]]:
+    until_us = webhooks.old_secrets_until(session, found)
+    return [
+        {
+            "id": webhook.id,
+            "url": webhook.url,
+            "events": webhook.events,
+            "description": webhook.description,
+            "disabled": webhook.disabled_us is not None,
+            "previous_secret_until": moment(until_us.get(webhook.id)),
+            "created_at": moment(webhook.created_us),
+        }
+        for webhook in found
+    ]
 
 
 def _shown(delivery: WebhookDelivery) -> DeliveryResource:

@@ -23,7 +23,7 @@ from service.database.tables._results import (
 )
 from service.database.tables._service import IdempotencyKey, Pass, WorkerSeen
 from service.database.tables._sessions import ConsoleSession
-from service.database.tables._webhooks import Webhook, WebhookDelivery
+from service.database.tables._webhooks import Webhook, WebhookDelivery, WebhookOldSecret
 
 __all__ = [
     "TERMINAL",
@@ -54,6 +54,7 @@ __all__ = [
     "Upload",
     "Webhook",
     "WebhookDelivery",
+    "WebhookOldSecret",
     "WorkerSeen",
     "new_id",
     "now_us",

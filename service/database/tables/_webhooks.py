@@ -22,10 +22,18 @@ class Webhook(Base):
     events: Mapped[list[Any]]
     description: Mapped[str] = mapped_column(String(200))
     secret: Mapped[str] = mapped_column(String(200))
-    previous_secret: Mapped[str | None] = mapped_column(String(200))
-    previous_until_us: Mapped[int | None]
     disabled_us: Mapped[int | None]
     created_us: Mapped[int] = mapped_column(default=now_us)
+
+
+class WebhookOldSecret(Base):
+    """A secret that was replaced. Until its end it signs beside the webhook's own."""
+
+    __tablename__ = "webhook_old_secrets"
+
+    webhook_id: Mapped[str] = mapped_column(ForeignKey("webhooks.id", ondelete="CASCADE"), primary_key=True)
+    secret: Mapped[str] = mapped_column(String(200), primary_key=True)
+    until_us: Mapped[int] = mapped_column(index=True)
 
 
 class WebhookDelivery(Base):
