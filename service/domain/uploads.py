@@ -12,7 +12,7 @@ from schemas.api.drives import DriveState
 from service.database.tables import Drive, Project, Upload, new_id, now_us
 from service.domain import drive_files, drives
 from service.domain.access import require
-from service.errors import TooManyUploads, UploadExpired, not_found
+from service.errors import EmptyArchive, ImageRefused, TooManyUploads, UploadExpired, not_found
 from service.storage import blobs
 from service.storage.blob_writer import StoredFile
 
@@ -48,6 +48,7 @@ def create(session: Session, *, project_id: str, drive_id: str, announced: Annou
     """
     drive = drives.get(session, project_id, drive_id, lock=True)
     drives.require_open(drive)
+    _require_bytes(announced)
     known = None
     if announced.path is not None:
         slot = drive_files.find(session, project_id, drive_id, announced.path)
@@ -76,6 +77,16 @@ def create(session: Session, *, project_id: str, drive_id: str, announced: Annou
     session.add(upload)
     session.flush()
     return upload
+
+
+def _require_bytes(announced: Announced) -> None:
+    """Refuse an upload of nothing: no request would end it, because none would have bytes to append."""
+    if announced.size_bytes > 0:
+        return
+    if announced.path is None:
+        raise EmptyArchive("the archive is empty (0 bytes)", remedy="Make it again, with the drive's images in it.")
+    what, remedy = f"image {announced.path} is empty (0 bytes)", "Copy it again from its source."
+    raise ImageRefused(what, remedy=remedy, code="empty-file")
 
 
 def _require_room(session: Session, project_id: str, size_bytes: int) -> None:

@@ -46,7 +46,7 @@ def before_call(context: Any, case: Any, kwargs: dict[str, Any]) -> None:
         case.headers = {**(case.headers or {}), "Tus-Resumable": "1.0.0"}
         if label == "POST /v1/drives/{drive_id}/uploads":
             path = base64.b64encode(_PATHS[chance // 2 % len(_PATHS)].encode()).decode()
-            case.headers |= {"Upload-Length": str(chance // 2 % 1000), "Upload-Metadata": f"path {path}"}
+            case.headers |= {"Upload-Length": str(1 + chance // 2 % 1000), "Upload-Metadata": f"path {path}"}
             case.headers.pop(KEY, None)
         elif label.startswith("PATCH"):
             case.headers |= {"Upload-Offset": "0"}

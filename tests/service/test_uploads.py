@@ -7,7 +7,9 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from datetime import UTC, datetime, timedelta
+from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
@@ -233,6 +235,25 @@ def test_expiry(api: Api, client: Client) -> None:
     assert stored(client, drive_id) == sha256_of(data)
 
 
+def test_every_request_renews_an_upload(api: Api, client: Client) -> None:
+    """Of a client that looks again and again how far its upload is, the bytes stay."""
+    data = image(1000)
+    url = begin(client, client.create(), PATH, data)
+    requests: list[Callable[[], httpx.Response]] = [
+        lambda: head(client, url),
+        lambda: patch(client, url, 0, data[:500]),
+        lambda: head(client, url),
+    ]
+    for request in requests:
+        with api.database.write() as session:
+            mine = update(Upload).where(Upload.id == url.rsplit("/", 1)[1])
+            session.execute(mine.values(expires_us=now_us() + 60_000_000))
+        renewed = parsedate_to_datetime(request().headers["upload-expires"])
+        assert renewed > datetime.now(UTC) + timedelta(hours=23)
+        (listed,) = client.get(f"{url.rpartition('/')[0]}").json()["items"]
+        assert datetime.fromisoformat(listed["expires_at"]) >= renewed
+
+
 def test_termination(api: Api, client: Client) -> None:
     data = image(1000)
     url = begin(client, client.create(), PATH, data)
@@ -427,6 +448,9 @@ def test_refused_creations(start_api: StartApi) -> None:
     problem_of(create(client, drive_id, 5, path="no.png"), 422, "not-in-manifest")
     problem_of(create(client, drive_id, 5), 400, "malformed-upload")
     problem_of(create(client, "drv_0", 5, path=PATH), 404, "not-found")
+    assert PATH in problem_of(create(client, drive_id, 0, path=PATH), 422, "empty-file")["detail"]
+    problem_of(create(client, drive_id, 0, archive=""), 422, "empty-archive")
+    assert client.get(f"/v1/drives/{drive_id}/uploads").json()["items"] == []
     assert create(client, drive_id, 9_000, path=PATH).status_code == 201
     assert create(client, drive_id, 9_000, path="rear/000000.png").status_code == 201
     problem_of(create(client, drive_id, 9_000, path="rear/000001.png"), 413, "quota-full")
@@ -476,7 +500,7 @@ def test_refused_requests(client: Client, api: Api) -> None:
     problem_of(patch(stranger, url, 0, data), 404, "not-found")
     problem_of(stranger.delete(url, headers=VERSION), 404, "not-found")
     assert api.anonymous().head(url, headers=VERSION).status_code == 401
-    assert patch(client, url, 0, data).status_code == 204
+    assert patch(client, url, 0, data, Content_Type="Application/Offset+Octet-Stream; x=1").status_code == 204
 
 
 def test_a_full_disk(start_api: StartApi) -> None:

@@ -64,6 +64,7 @@ def _secured(context: Context, project_id: str, drive_id: str, upload_id: str) -
         held = _Held(context, project_id, drive_id, upload_id, file)
         held.require_wanted()
         held.secure()
+        held.renew()
     except BaseException:
         file.close()
         raise
@@ -215,6 +216,11 @@ class _Held:
         """Put all bytes that count on the disk, and record so."""
         if not self.upload.is_done and self.offset > self.upload.kept_bytes:
             self.keep(self.offset)
+
+    def renew(self) -> None:
+        """Let the upload live on from now: a client that asks how far it is wants to go on."""
+        if not self.upload.is_done:
+            self._record(durable=False)
 
     def keep(self, offset: int) -> None:
         """End the upload here."""

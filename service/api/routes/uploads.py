@@ -175,7 +175,7 @@ async def get_upload_offset(
     drive_id: str, upload_id: str, caller: CallerDep, context: ContextDep, tus_resumable: Resumable = None
 ) -> Response:
     """Offset from which to go on. All bytes up to `Upload-Offset` are here, also after a crash of the service or its
-    machine.
+    machine. Like every request, this one lets the upload live on until `Upload-Expires`.
     """
     tus.require_version(tus_resumable)
     upload, offset = await current_offset(context, caller.project_id, drive_id, upload_id)
@@ -220,7 +220,7 @@ async def append_to_upload(
     What came before a connection broke is kept; with `Upload-Checksum` only what was compared.
     """
     tus.require_version(tus_resumable)
-    if request.headers.get("content-type", "").partition(";")[0].strip() != tus.CONTENT_TYPE:
+    if request.headers.get("content-type", "").partition(";")[0].strip().lower() != tus.CONTENT_TYPE:
         raise WrongMediaType(
             f"Content-Type is {request.headers.get('content-type')!r}", remedy=f"Send Content-Type: {tus.CONTENT_TYPE}."
         )
