@@ -62,14 +62,14 @@ def test_a_turn_observes_focal_lengths_and_frees_what_the_model_has() -> None:
 @pytest.mark.parametrize("cameras", [2, *slow(4)])
 def test_what_is_not_observed_is_held_and_said(cameras: int) -> None:
     mapper, simulated = model(straight=True, cameras=cameras)
-    good = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": 0.001})
+    good = mapper.config.bundle_adjustment.model_copy(update={"sigma_focal": 0.0005})
     mapper.config = mapper.config.model_copy(update={"bundle_adjustment": good})
     found = decide(mapper, simulated)
-    assert (found.sigma_focal > 0.001 / 2).all()
+    assert (found.sigma_focal > 0.0005 / 2).all()
     assert not found.free.any()
     said = found.findings(mapper)
     assert [f.code for f in said] == ["focal-not-observed"] * cameras
-    assert "prior says 0.10%" in said[0].what
+    assert "prior says 0.05%" in said[0].what
 
 
 def test_half_of_the_prior_is_observed() -> None:
