@@ -95,7 +95,8 @@ def place_by_gnss(
     if takes_scale and len(units) > 1:
         factor = _extent(measured[units]) / _extent(mapper.state.unit_position_m[units])
         scale = scale_with_baselines if single or rig_may_be_wrong else scale_scene
-        alignment = _with_receivers_scale(mapper, align, factor, scale)
+        bound = np.inf if single or rig_may_be_wrong else sigma_rig_scale
+        alignment = _with_receivers_scale(mapper, align, factor, scale, sigma_rig_scale=bound)
     else:
         alignment = align()
     if isinstance(alignment, Refusal):
@@ -148,8 +149,14 @@ def _with_receivers_scale(
     align: Callable[[], GnssAlignment | Refusal],
     factor: float,
     scale: Callable[[Mapper, float], None],
+    *,
+    sigma_rig_scale: float,
 ) -> GnssAlignment | Refusal:
-    """Scale the scene to the receiver, beginning with a factor, and align it; it stays as it is if that fails."""
+    """Scale the scene to the receiver, beginning with a factor, and align it; it stays as it is if that fails.
+
+    A receiver that hardly knows how long its own trajectory is does not overrule what is known of the rig's scale:
+    where both exclude one another, a scale between them would be neither.
+    """
     begun = copy.deepcopy(mapper.state)
     scale(mapper, factor)
     alignment = align()
@@ -157,6 +164,14 @@ def _with_receivers_scale(
         if isinstance(alignment, GnssAlignment):
             scale(mapper, alignment.scale)
             factor, alignment = factor * alignment.scale, align()
+    if isinstance(alignment, GnssAlignment) and alignment.sigma_scale > UNKNOWN_SIGMA_SCALE:
+        known = float(np.hypot(sigma_rig_scale, factor * alignment.sigma_scale))  # of the rig's length
+        if abs(factor - 1.0) > SCALE_DISAGREEMENT_SIGMAS * known:
+            alignment = Refusal(
+                reason=f"the receiver's trajectory is {factor:.3g} times as long as the rig's, and it hardly knows its "
+                "own length",
+                is_of_scale=True,
+            )
     if isinstance(alignment, Refusal):
         scale(mapper, 1.0 / factor)  # also poses of single images, which are no part of the state,
         mapper.state = begun  # and without what that rounds
