@@ -19,6 +19,7 @@ from schemas import BodyAxes, Camera, Gnss, GnssSample, LabelMap
 # Calibrations made with OpenCV's tools put the origin at the centre of the top left pixel; manifests, as COLMAP, at its
 # corner. The principal point moves by this, focal length and distortion are the same in both.
 PIXEL_CENTER_PX = 0.5
+LAST_ROW_ERROR = 1e-6  # of a 3x3 or 4x4 matrix: those rows are constants, which rounding hardly touches
 
 T = TypeVar("T")
 
@@ -264,12 +265,19 @@ def proper_transform(matrix: Floats, *, what: str) -> Floats:
     Raises
     ------
     InputError
-        If it is not finite or its rotation is not orthonormal within 1e-3 or mirrors.
+        If it is not finite, its fourth row is not 0, 0, 0, 1, or its rotation is not orthonormal within 1e-3 or mirrors.
     """
     remedy = "Give a rotation matrix and a translation in metres."
     r = matrix[:3, :3]
     if not np.isfinite(matrix).all():
         raise InputError(f"{what} holds a value that is not finite", remedy=remedy, code="bad-transform")
+    # The rotation of a transposed matrix is a rotation too, and the translation of one is zero: this row alone tells.
+    if len(matrix) == 4 and abs(matrix[3] - (0, 0, 0, 1)).max() > LAST_ROW_ERROR:
+        raise InputError(
+            f"{what}: the fourth row is {', '.join(f'{value:g}' for value in matrix[3])} instead of 0, 0, 0, 1",
+            remedy="Is the matrix transposed? Give it row by row: the translation is its fourth column, in metres.",
+            code="bad-transform",
+        )
     if abs(r @ r.T - np.eye(3)).max() > 1e-3:
         raise InputError(f"{what} is not a rigid transform: its rotation is not orthonormal", remedy=remedy)
     if np.linalg.det(r) < 0:

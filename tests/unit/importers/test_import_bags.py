@@ -654,6 +654,14 @@ def test_a_chain_that_does_not_fit_is_refused(tmp_path: Path, old: str, new: str
     assert message in refused(stereo(), tmp_path, calibration=tmp_path / "camchain.yaml")
 
 
+def test_a_transposed_chain_is_refused(tmp_path: Path) -> None:
+    right_from_left = se3.transform(np.eye(3), [-0.5, 0, 0])
+    (tmp_path / "camchain.yaml").write_text(camchain(right_from_left.T))
+    message = refused(stereo(), tmp_path, calibration=tmp_path / "camchain.yaml")
+    assert "camchain.yaml: cam1: T_cn_cnm1: the fourth row is -0.5, 0, 0, 1" in message
+    assert "transposed?" in message
+
+
 def test_a_rig_file_replaces_camera_info_and_transforms(tmp_path: Path) -> None:
     poses = {"left": LEFT, "right": RIGHT}
     cameras = {

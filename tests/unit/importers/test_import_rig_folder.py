@@ -261,6 +261,21 @@ def test_bad_calibrations(recording: Path, tmp_path: Path, edit: Edit, message: 
         assert message in refused(recording, tmp_path / "drive").what
 
 
+def test_a_transposed_pose_is_refused(recording: Path, tmp_path: Path) -> None:
+    def transpose(document: dict[str, Any]) -> None:
+        camera = document["cameras"]["cam_r"]
+        camera["T_body_cam"] = np.transpose(camera["T_body_cam"]).tolist()
+
+    edit_rig(recording, transpose)
+    error = refused(recording, tmp_path / "drive")
+    assert "rig.json: cameras.cam_r.T_body_cam: the fourth row is 0.5, 0, 0, 1" in error.what
+    assert "transposed?" in error.remedy
+    # A pose without its last row has nothing to be transposed.
+    edit_rig(recording, lambda document: document["cameras"]["cam_r"]["T_body_cam"].pop())
+    import_recording(recording, tmp_path / "drive")
+    assert read_drive(tmp_path / "drive").rig_from_cam[1][1, 3] == pytest.approx(-0.5)
+
+
 def test_other_camera_models_come_with_their_parameters(recording: Path, tmp_path: Path) -> None:
     params = [40.0, 41.0, 24.0, 16.0, 0.01, 0.0, 0.0, 0.0]
 
