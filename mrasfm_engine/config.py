@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mrasfm_engine.errors import InputError
+from schemas.drive import SIGMA_TRANSLATION_M
 from schemas.methods import ExtractorName, MatcherName
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -187,7 +188,9 @@ class BundleAdjustmentConfig(_Section):
     )
     loss_scale: Positive = Field(2.0, description="of the Cauchy loss, in standard deviations of an observation")
     sigma_rotation_deg: Positive = Field(2.0, description="prior of `rig_from_cam` where the manifest declares none")
-    sigma_translation_m: Positive = Field(0.05, description="prior of `rig_from_cam` where the manifest declares none")
+    sigma_translation_m: Positive = Field(
+        SIGMA_TRANSLATION_M, description="prior of `rig_from_cam` where the manifest declares none"
+    )
     sigma_focal: Positive = Field(
         0.01,
         description="prior of a focal length relative to itself, where intrinsics vary and the manifest declares none",

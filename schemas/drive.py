@@ -52,6 +52,10 @@ MAX_IMAGE_SIDE_PX = 20_000
 MAX_XI = 10.0  # of a MEI camera: 0 is a pinhole, 1 a parabolic mirror, fisheyes have 1 to 3
 MAX_PATH_CHARACTERS = 512
 MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin than this is a unit error
+# The longest rigid road vehicle, a bus of three axles (directive 96/53/EC, annex I): a rig does not bend, so that
+# cameras of one are no farther apart. Rails and mines have longer ones.
+LONGEST_VEHICLE_M = 15.0
+SIGMA_TRANSLATION_M = 0.05  # of a camera's place on the vehicle where the manifest declares none
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_SIGMA_TIME_OFFSET_US = 1_000_000
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic

@@ -7,6 +7,7 @@ it begins with, and prints the findings as JSON.
 from __future__ import annotations
 
 import json
+import math
 import resource
 import sys
 from bisect import bisect_left, bisect_right
@@ -14,12 +15,13 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import BodyAxes, DriveManifest, Pose
+from schemas.drive import LONGEST_VEHICLE_M, SIGMA_TRANSLATION_M, BodyAxes, Camera, DriveManifest, Pose
 from schemas.findings import Finding, Severity, as_json, error, listed, warning
 from schemas.gnss_check import check_gnss
 from schemas.parsing import DocumentError, parse_manifest
@@ -53,6 +55,7 @@ def check_manifest(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Fi
             *_check_frames(recorded),
             *_check_times(recorded),
             *_check_rig(manifest),
+            *_check_extent(recorded),
             *_check_scale(recorded, use_gnss=use_gnss),
             *_check_rough_poses(recorded),
             *(check_gnss(manifest, recorded.image_times_us) if use_gnss else []),
@@ -88,6 +91,15 @@ class _Recorded:
     def used_cameras(self) -> set[str]:
         """Cameras with images."""
         return {camera for camera, *_ in self.images}
+
+    @cached_property
+    def baselines(self) -> list[tuple[Camera, Camera, float]]:
+        """Pairs of cameras with images, and their distance in metres."""
+        used = [camera for camera in self.manifest.rig.cameras if camera.name in self.used_cameras]
+        return [
+            (a, b, math.dist(a.rig_from_cam.translation_m, b.rig_from_cam.translation_m))
+            for a, b in combinations(used, 2)
+        ]
 
     @cached_property
     def image_times_us(self) -> NDArray[np.int64]:
@@ -187,26 +199,69 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
     return [warning("camera-turned", what, remedy)]
 
 
-def _check_scale(recorded: _Recorded, *, use_gnss: bool) -> list[Finding]:
-    if len(recorded.used_cameras) > 1:
+def _check_extent(recorded: _Recorded) -> list[Finding]:
+    """Find cameras farther apart than a vehicle is long: centimetres, or the map's coordinates."""
+    apart = [(distance_m, a.name, b.name) for a, b, distance_m in recorded.baselines if distance_m > LONGEST_VEHICLE_M]
+    if not apart:
         return []
+    distance_m, *names = max(apart)
+    return [
+        warning(
+            "rig-extent",
+            f"rig.cameras: cameras {' and '.join(names)} are {distance_m:.1f} m apart, and the longest rigid road "
+            f"vehicle has {LONGEST_VEHICLE_M:g} m",
+            "Give the translation_m of rig_from_cam in metres, not in centimetres or millimetres.",
+        )
+    ]
+
+
+def _check_scale(recorded: _Recorded, *, use_gnss: bool) -> list[Finding]:
+    if len(recorded.used_cameras) < 2:
+        return _without_baselines(
+            recorded,
+            use_gnss=use_gnss,
+            code="scale-not-from-rig",
+            what="the drive has images of one camera only",
+            remedy="Give the images of all cameras for a scale that the rig's baselines confirm.",
+            or_else="Give a second camera, GNSS or rough poses.",
+        )
+    # A baseline within the error of its ends may as well be none. Cameras that are close together and measured to
+    # millimetres say so by their sigmas.
+    if any(distance_m > 0 and distance_m >= max(map(_sigma_m, (a, b))) for a, b, distance_m in recorded.baselines):
+        return []
+    longest_m = max(distance_m for *_, distance_m in recorded.baselines)
+    place = f"within {longest_m:.2g} m, less than their sigma_translation_m" if longest_m else "at one place"
+    measure = "Measure where the cameras are on the vehicle and give it as the translation_m of rig_from_cam"
+    return _without_baselines(
+        recorded,
+        use_gnss=use_gnss,
+        code="baselines-missing",
+        what=f"rig.cameras: all cameras are {place}, so that no baseline gives a scale",
+        remedy=f"{measure}.",
+        or_else=f"{measure}, with sigma_translation_m where they are close together; or give GNSS or rough poses.",
+    )
+
+
+def _without_baselines(
+    recorded: _Recorded, *, use_gnss: bool, code: str, what: str, remedy: str, or_else: str
+) -> list[Finding]:
+    """The finding of a drive whose rig gives no scale: an error where nothing else gives it one.
+
+    Parameters
+    ----------
+    remedy, or_else
+        Of the warning, and of the error.
+    """
     gnss = use_gnss and recorded.manifest.gnss is not None
     if gnss or recorded.manifest.rough_poses is not None:
         source = "GNSS" if gnss else "the rough poses"
-        return [
-            warning(
-                "scale-not-from-rig",
-                f"the drive has images of one camera only: its scale comes from {source} alone",
-                "Give the images of all cameras for a scale that the rig's baselines confirm.",
-            )
-        ]
-    return [
-        error(
-            "no-metric-scale",
-            "the drive has images of one camera only and neither GNSS nor rough poses: nothing gives it a scale",
-            "Give a second camera, GNSS or rough poses.",
-        )
-    ]
+        return [warning(code, f"{what}: the drive's scale comes from {source} alone", remedy)]
+    lacks = "and there are neither GNSS nor rough poses: nothing gives the drive a scale"
+    return [error("no-metric-scale", f"{what}, {lacks}", or_else)]
+
+
+def _sigma_m(camera: Camera) -> float:
+    return SIGMA_TRANSLATION_M if camera.sigma_translation_m is None else camera.sigma_translation_m
 
 
 def _check_rough_poses(recorded: _Recorded) -> list[Finding]:

@@ -265,7 +265,7 @@ def proper_transform(matrix: Floats, *, what: str) -> Floats:
     Raises
     ------
     InputError
-        If it is not finite, its fourth row is not 0, 0, 0, 1, or its rotation is not orthonormal within 1e-3 or mirrors.
+        If it is not finite, a fourth row is not 0, 0, 0, 1, or its rotation is not orthonormal within 1e-3 or mirrors.
     """
     remedy = "Give a rotation matrix and a translation in metres."
     r = matrix[:3, :3]

@@ -91,6 +91,52 @@ def test_gnss_that_is_not_used_is_not_checked(drive_document: Document) -> None:
     assert parsed(drive_document, use_gnss=False) == []
 
 
+def placed(d: Document, *positions_m: list[float], sigma_m: float | None = None) -> None:
+    for camera, position_m in zip(d["rig"]["cameras"], positions_m, strict=True):
+        camera["rig_from_cam"]["translation_m"] = position_m
+        if sigma_m is not None:
+            camera["sigma_translation_m"] = sigma_m
+
+
+@pytest.mark.parametrize(
+    ("right_m", "sigma_m", "is_known"),
+    [(0.0, None, False), (0.0, 0.001, False), (0.03, None, False), (0.03, 0.001, True), (0.06, None, True)],
+)
+def test_a_rig_without_baselines_has_no_scale(
+    drive_document: Document, right_m: float, sigma_m: float | None, is_known: bool
+) -> None:
+    """Cameras at one place, or closer than their sigmas: only positions of the vehicle can give a scale."""
+    placed(drive_document, [1.5, 0.0, 1.6], [1.5, -right_m, 1.6], sigma_m=sigma_m)
+    found = {finding.code: finding for finding in parsed(drive_document)}
+    assert set(found) == (set() if is_known else {"baselines-missing"})
+    assert is_sound([*found.values()])
+    if not is_known:
+        assert found["baselines-missing"].what.startswith("rig.cameras")
+        assert "scale comes from GNSS alone" in found["baselines-missing"].what
+        assert "translation_m" in found["baselines-missing"].remedy
+    without = parsed(drive_document, use_gnss=False)
+    assert codes(without) == ([] if is_known else ["no-metric-scale"])
+    if not is_known:
+        assert without[0].what.startswith("rig.cameras: all cameras are ")
+        assert not is_sound(without)
+        pose = {"rotation_xyzw": [0.0, 0.0, 0.0, 1.0], "translation_m": [0.0, 0.0, 0.0]}
+        times_us = [frame["timestamp_us"] for frame in drive_document["frames"]]
+        drive_document["rough_poses"] = {"poses": [{"timestamp_us": t, "world_from_rig": pose} for t in times_us]}
+        assert codes(parsed(drive_document, use_gnss=False)) == ["baselines-missing"]
+
+
+def test_a_rig_longer_than_any_vehicle(drive_document: Document) -> None:
+    """The front and the back camera of a bus, and a stereo pair in centimetres."""
+    placed(drive_document, [12.0, 0.0, 2.5], [0.0, 0.0, 2.5])
+    assert parsed(drive_document) == []
+    placed(drive_document, [0.0, 27.0, 90.0], [0.0, -27.0, 90.0])
+    (finding,) = parsed(drive_document)
+    assert finding.code == "rig-extent"
+    assert "are 54.0 m apart" in finding.what
+    assert "centimetres" in finding.remedy
+    assert is_sound([finding])
+
+
 def test_body_axes_are_converted(drive_document: Document, write_drive: WriteDrive) -> None:
     """Upright cameras of a rig whose axes are the camera's: x right, y down, z forward."""
     drive_document["rig"]["body_axes"] = "rdf"
