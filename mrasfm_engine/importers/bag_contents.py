@@ -10,9 +10,10 @@ from typing import Any
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.bag_cameras import camera_name, chosen_topics, same_calibration
-from mrasfm_engine.importers.bag_images import holds_depth, largest_value, size_and_suffix, unused_bits
+from mrasfm_engine.importers.bag_images import holds_depth, largest_value, size_and_suffix
 from mrasfm_engine.importers.bag_reader import Bag, Entry
 from mrasfm_engine.importers.bag_transforms import TransformTree
+from mrasfm_engine.io.images import unused_bits
 from schemas.drive import MAX_GNSS_SAMPLES
 
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"

@@ -41,7 +41,6 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
 }
 DEPTH_ENCODINGS = frozenset({"16UC1", "32FC1"})  # ROS's images of distances
 SUBSAMPLED = frozenset({"yuv422", "uyvy", "yuv422_yuy2", "yuyv"})  # two pixels share their colour
-SENSOR_BITS = (10, 12, 14)  # of sensors whose drivers fill the lower bits of 16
 PNG_EFFORT = 1  # of 9: more makes files a few percent smaller and takes several times as long
 
 
@@ -112,12 +111,6 @@ def largest_value(message: Any, *, topic: str) -> int:
     if not is_raw(message) or _ENCODINGS[message.encoding][0] != "u2":
         return 0
     return int(_values(message, topic).max())
-
-
-def unused_bits(largest: int) -> int:
-    """Bits by which values of 16 bits are too small where a sensor of fewer bits fills the lower ones."""
-    bits = next((bits for bits in SENSOR_BITS if largest >> bits == 0), 16)
-    return 16 - bits if largest else 0
 
 
 def file_content(message: Any, *, topic: str, shift: int = 0) -> bytes:

@@ -10,9 +10,32 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_decoding import Colours, decode_jpeg, decode_jpeg_small, decode_png
-from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular
+from mrasfm_engine.io.image_header import ImageHeader, ImageKind, header_of, open_regular, read_header
 from mrasfm_engine.types import Bytes
 from schemas import LabelMap
+
+SENSOR_BITS = (8, 10, 12, 14)  # of sensors whose drivers fill the lower bits of 16
+
+
+def unused_bits(largest: int) -> int:
+    """Bits by which values of 16 bits are too small where a sensor of fewer bits fills the lower ones."""
+    bits = next((bits for bits in SENSOR_BITS if largest >> bits == 0), 16)
+    return 16 - bits if largest else 0
+
+
+def read_largest_of_16_bits(path: Path) -> int:
+    """Largest value of an image of 16 bits a channel, without its alpha channel; 0 of all others.
+
+    Raises
+    ------
+    InputError
+        As `read_image_gray`.
+    """
+    if read_header(Path(path)).bits != 16:
+        return 0
+    data, header = _load(path)
+    image = decode_png(data, cv2.IMREAD_UNCHANGED, header, path)
+    return int((image if image.ndim == 2 else image[..., :3]).max())
 
 
 def read_image_gray(path: Path) -> Bytes:

@@ -19,7 +19,7 @@ import numpy as np
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
-from mrasfm_engine.io.images import read_image_gray
+from mrasfm_engine.io.images import read_image_gray, read_largest_of_16_bits, unused_bits
 from mrasfm_engine.io.left_out_images import sample_findings
 from mrasfm_engine.io.repeated_images import have_same_contents
 from mrasfm_engine.preflight.drive_check import check_drive, is_sound
@@ -40,6 +40,7 @@ MOVEMENT_SIDE_PX = 320  # movement at this one: there noise and compression hard
 # sigma halves it. But in the noise of an image that shows nothing else it rises again, so little detail counts as well.
 FINE_PX, COARSE_PX = 0.8, 2.0  # sigmas, against noise and to blur
 BLURRED_FINENESS, BLURRED_DETAIL = 0.6, 0.1  # of the camera's median
+USELESS_LEVELS = 16  # of gray in a whole image: features need differences of some levels from pixel to pixel
 BLURRED_CAMERA_FINENESS, BLURRED_CAMERA_DETAIL = 0.5, 0.05  # of the other cameras' median
 
 APART_US = 90_000  # images that are compared for movement: at 10 Hz, neighbours
@@ -57,6 +58,7 @@ class _Look:
     detail: float
     fineness: float
     small: Floats32
+    largest_of_16_bits: int  # 0: the image has 8
 
 
 def inspect_drive(
@@ -129,6 +131,7 @@ def check_content(
     return [
         *findings,
         *sample_findings(incomplete, len(images)),
+        *_check_bits(drive, [*looks.values()]),
         *_check_sharpness(drive, [look for i, look in looks.items() if i in paired]),
         *_check_movement(drive, [(looks[a], looks[b]) for a, b in pairs if a in looks and b in looks], use_gnss),
     ]
@@ -188,6 +191,7 @@ def _sampled_besides(drive: Drive, taken: set[int]) -> set[int]:
 def _look(drive: Drive, image: DriveImage) -> _Look | LeftOut | Finding:
     try:
         pixels = read_image_gray(drive.root / image.file)
+        largest = read_largest_of_16_bits(drive.root / image.file)
     except IncompleteImageError as problem:
         return problem.reason
     except InputError as problem:
@@ -202,6 +206,7 @@ def _look(drive: Drive, image: DriveImage) -> _Look | LeftOut | Finding:
         detail=detail / (_variance(gray) + 25.0),  # so that a dull image is not a blurred one
         fineness=detail / (coarse_detail + 0.02),
         small=np.asarray(cv2.GaussianBlur(_reduced(pixels, MOVEMENT_SIDE_PX), (0, 0), 1.0), dtype=np.float32),
+        largest_of_16_bits=largest,
     )
 
 
@@ -215,6 +220,28 @@ def _reduced(pixels: Bytes, side_px: int) -> Floats32:
 
 def _variance(values: Floats32) -> float:
     return float(np.var(values))
+
+
+def _check_bits(drive: Drive, looks: Sequence[_Look]) -> list[Finding]:
+    """Find cameras whose images of 16 bits leave the upper ones empty.
+
+    They are refused and not raised on reading: the factor has to be the same for all images of a camera, and a sample,
+    or the part of a drive that one process has, does not show for certain which it is. Whoever has all images knows.
+    """
+    findings = []
+    for number, camera in enumerate(drive.cameras):
+        shift = unused_bits(max((look.largest_of_16_bits for look in looks if look.image.camera == number), default=0))
+        if shift:
+            levels = max(1, 2 ** (8 - shift))
+            findings.append(
+                (error if levels <= USELESS_LEVELS else warning)(
+                    "unused-bits",
+                    f"images of camera {camera.name} use the lower {16 - shift} of 16 bits: read with the upper 8, "
+                    f"they are dark and have {levels} gray levels",
+                    f"Take all values of all images of the camera times {2**shift}, or save the images with 8 bits.",
+                )
+            )
+    return findings
 
 
 def _check_sharpness(drive: Drive, looks: Sequence[_Look]) -> list[Finding]:

@@ -21,7 +21,10 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Per code: severity, what is wrong with "N images" (%s is the list of files), remedy.
 _GROUPED = {
     "alpha-channel": ("have an alpha channel, which is ignored", "Nothing needs to be done."),
-    "16-bit-image": ("have 16 bits a channel and are read with 8", "Nothing needs to be done."),
+    "16-bit-image": (
+        "have 16 bits a channel and are read with the upper 8 of them",
+        "Nothing needs to be done where their values reach up to 65535.",
+    ),
     "palette-image": ("have a palette: their colours are quantised", "Give the camera's own images if you can."),
 }
 

@@ -537,10 +537,10 @@ def test_padded_rows_and_big_endian_values(tmp_path: Path) -> None:
     assert np.array_equal(found, values.astype(np.uint16))
 
 
-@pytest.mark.parametrize(("bits", "encoding"), [(12, "mono16"), (10, "bayer_rggb16"), (14, "rgb16")])
+@pytest.mark.parametrize(("bits", "encoding"), [(12, "mono16"), (10, "bayer_rggb16"), (14, "rgb16"), (8, "bgr16")])
 def test_sensors_of_fewer_bits_in_16(tmp_path: Path, bits: int, encoding: str) -> None:
     """As they are, pictures of 12 bits would be all but black in 8."""
-    shape = (SIZE[1], SIZE[0], 3) if encoding == "rgb16" else (SIZE[1], SIZE[0])
+    shape = (SIZE[1], SIZE[0], 3) if encoding in ("rgb16", "bgr16") else (SIZE[1], SIZE[0])
     values = np.random.default_rng(1).integers(2 ** (bits - 1), 2**bits, shape).astype("<u2")
     made = stereo()
     packed(values, encoding)(made)

@@ -146,6 +146,29 @@ def test_images_that_show_nothing(make_drive: Callable[..., Path]) -> None:
     assert findings_of(root) == []
 
 
+@pytest.mark.parametrize(
+    ("factor", "severity"),
+    [(1, "error"), (4, "error"), (16, "error"), (64, "warning"), (257, None), (16 * 16, None)],
+    ids=["8 bits", "10 bits", "12 bits", "14 bits", "16 bits", "12 bits times 16"],
+)
+@pytest.mark.parametrize("has_alpha", [False, True])
+def test_images_that_leave_bits_unused(
+    make_drive: Callable[..., Path], factor: int, severity: str | None, has_alpha: bool
+) -> None:
+    """Images of a sensor's 12 bits in files of 16 would have 16 gray levels: nothing is found in them."""
+    root = make_drive()
+    for path in (root / "images/left").iterdir():
+        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.uint16) * factor
+        if has_alpha:
+            values = np.dstack([values, values, values, np.full_like(values, 65535)])
+        assert cv2.imwrite(str(path), values)
+    found = [finding for finding in findings_of(root) if finding.code == "unused-bits"]
+    assert [finding.severity for finding in found] == ([] if severity is None else [severity])
+    if found:
+        assert "camera left" in found[0].what
+        assert f"times {256 // factor}," in found[0].remedy
+
+
 @pytest.mark.parametrize("sigma", [2.0, 6.0])
 def test_some_blurred_images(make_drive: Callable[..., Path], sigma: float) -> None:
     def paint(camera: str, frame: int, image: np.ndarray) -> np.ndarray:
