@@ -94,12 +94,11 @@ def lens_from_camera_info(info: Any, *, topic: str, size: tuple[int, int], recti
             remedy=_CALIBRATE,
             code="not-calibrated",
         )
+    params = pinhole_params(matrix, what=f"{topic}: {'P' if rectified else 'K'}")
     lens = (
-        Lens(model="PINHOLE", params=pinhole_params(matrix))
+        Lens(model="PINHOLE", params=params)
         if rectified
-        else lens_from_distortion(
-            pinhole_params(matrix), str(info.distortion_model), _field(info, "D").tolist(), where=topic
-        )
+        else lens_from_distortion(params, str(info.distortion_model), _field(info, "D").tolist(), where=topic)
     )
     return _as_sent(lens, info, topic=topic, size=size)
 

@@ -23,6 +23,8 @@ from mrasfm_engine.importers.rig_folder import checked_camera, read_rig
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera
+from schemas.drive import MAX_CAMERAS
+from schemas.findings import listed
 
 
 def cameras_of_bag(content: BagContent, calibration: Path | None, rig_frame: str) -> tuple[list[Camera], list[str]]:
@@ -43,7 +45,7 @@ def cameras_of_bag(content: BagContent, calibration: Path | None, rig_frame: str
     if calibration is None:
         return _cameras_of_infos(content, rig_frame), []
     if calibration.suffix == ".json":
-        return _cameras_of_rig(content, calibration), []
+        return _cameras_of_rig(content, calibration)
     return _cameras_of_chain(content, calibration, rig_frame)
 
 
@@ -102,8 +104,9 @@ def _info_of(topic: str, images: ImageTopic, infos: dict[str, Any]) -> tuple[str
     return candidates[0], infos[candidates[0]]
 
 
-def _cameras_of_rig(content: BagContent, file: Path) -> list[Camera]:
-    known = {camera.name: camera for camera in read_rig(file)[0]}
+def _cameras_of_rig(content: BagContent, file: Path) -> tuple[list[Camera], list[str]]:
+    read, rig = read_rig(file)
+    known = {camera.name: camera for camera in read}
     cameras = []
     for topic, images in content.images.items():
         camera = known.get(camera_name(topic))
@@ -115,7 +118,7 @@ def _cameras_of_rig(content: BagContent, file: Path) -> list[Camera]:
             )
         _require_size(f"calibration {file}: {camera.name}", (camera.width, camera.height), images, topic)
         cameras.append(camera)
-    return cameras
+    return cameras, rig.notes(file)
 
 
 def _require_size(where: str, size: tuple[int, int], images: ImageTopic, topic: str) -> None:
@@ -156,6 +159,11 @@ def _cameras_of_chain(content: BagContent, file: Path, rig_frame: str) -> tuple[
         images, where = content.images[topic], f"calibration {file}: {camera.name}"
         _require_size(where, camera.size, images, topic)
         cameras.append(_camera(topic, camera.lens, images.size, rig_from_first @ camera.first_from_cam, source=where))
+    if shifted := [f"{camera.name} ({camera.timeshift_s:g} s)" for camera in chain.values() if camera.timeshift_s]:
+        notes.append(
+            f"{file.name}: timeshift_cam_imu is not applied: {listed(shifted, MAX_CAMERAS)}. Times of images are those "
+            "of the bag; where the receiver's clock is another one, give images.*.timestamp_us in drive.json on it."
+        )
     return cameras, notes
 
 

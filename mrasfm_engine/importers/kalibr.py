@@ -31,6 +31,7 @@ class _Camera(BaseModel):
     resolution: Annotated[list[int], Field(min_length=2, max_length=2)]
     rostopic: str
     T_cn_cnm1: Annotated[list[_Row4], Field(min_length=3, max_length=4)] | None = None
+    timeshift_cam_imu: Finite | None = None
 
 
 _Chain = RootModel[Annotated[dict[str, _Camera], Field(min_length=1, max_length=MAX_CAMERAS)]]
@@ -45,6 +46,7 @@ class ChainCamera:
     size: tuple[int, int]
     lens: Lens
     first_from_cam: Floats  # (4, 4), in the chain's first camera
+    timeshift_s: float  # to be added to the camera's times for those of Kalibr's inertial unit
 
 
 def read_camchain(path: Path) -> list[ChainCamera]:
@@ -88,6 +90,7 @@ def read_camchain(path: Path) -> list[ChainCamera]:
                 size=(camera.resolution[0], camera.resolution[1]),
                 lens=_lens(camera, where),
                 first_from_cam=pose,
+                timeshift_s=camera.timeshift_cam_imu or 0.0,
             )
         )
     return cameras

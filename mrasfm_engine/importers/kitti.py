@@ -13,7 +13,7 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit
+from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, pose_of_projection
 from mrasfm_engine.importers.rig_folder import frame_times, numbered_images, pinhole_camera, read_upright_poses
 from mrasfm_engine.importers.tables import read_lines
 from mrasfm_engine.io.axes import flu_from_body
@@ -104,13 +104,6 @@ def _camera(
             remedy=f"Give it, or take the folder {name} away.",
             code="bad-calibration",
         )
-    k, p4 = projections[name][:, :3], projections[name][:, 3]
-    if abs(np.linalg.det(k)) < 1e-6 or abs(k[[1, 2, 2, 0], [0, 0, 1, 1]]).max() > 1e-6 or abs(k[2, 2] - 1) > 1e-6:
-        raise InputError(
-            f"calibration {file}: P{name[-1]} does not begin with a calibration matrix without skew",
-            remedy="Give the calib.txt of the benchmark.",
-            code="bad-calibration",
-        )
-    cam_from_body = se3.transform(np.eye(3), np.linalg.solve(k, p4))
-    rig_from_cam = flu_body @ se3.inverse(cam_from_body)
-    return pinhole_camera(name, images, k, rig_from_cam, source=f"{file}: P{name[-1]}")
+    projection, source = projections[name], f"{file}: P{name[-1]}"
+    rig_from_cam = flu_body @ se3.inverse(pose_of_projection(projection, what=source))
+    return pinhole_camera(name, images, projection[:, :3], rig_from_cam, source=source)

@@ -22,6 +22,7 @@ from mrasfm_engine.importers.recording import (
     choose_scene,
     gnss_of_vehicle,
     interpolated_poses,
+    pose_of_projection,
     proper_transform,
 )
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
@@ -116,7 +117,7 @@ def _camera(
 ) -> Camera:
     file, key = day / "calib_cam_to_cam.txt", f"P_rect_{name[-2:]}"
     projection = _values(calibration, key, 12, file).reshape(3, 4)
-    cam_from_cam0 = se3.transform(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
+    cam_from_cam0 = pose_of_projection(projection, what=f"{file}: {key}")
     rig_from_cam = rig_from_cam0 @ se3.inverse(cam_from_cam0)
     return pinhole_camera(name, images, projection[:, :3], rig_from_cam, source=f"{file}: {key}")
 

@@ -154,7 +154,8 @@ def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Re
     antenna_file = file.parent / ANTENNA_FILE
     if not antenna_file.exists():
         antenna_file = folder / ANTENNA_FILE
-    antenna = flu_from_body(recording.body_axes)[:3, :3] @ read_antenna(antenna_file)
+    in_body_m, notes = read_antenna(antenna_file)
+    antenna = flu_from_body(recording.body_axes)[:3, :3] @ in_body_m
     if np.abs(antenna).max() > MAX_RIG_EXTENT_M:
         raise InputError(
             f"antenna position {antenna_file} is over {MAX_RIG_EXTENT_M:g} m from the vehicle's origin",
@@ -162,7 +163,7 @@ def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Re
         )
     samples = samples_around(read_gnss_csv(file), recording.units)
     gnss = Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[float(v) for v in antenna], samples=samples)
-    return replace(recording, gnss=gnss)
+    return replace(recording, gnss=gnss, notes=[*recording.notes, *notes])
 
 
 def _find(gnss_file: Path, folder: Path) -> Path:

@@ -303,7 +303,7 @@ def _camera(name: str, data: _SampleData, calibration: _Calibrated, tables: Path
         name,
         model="PINHOLE",
         size=(data.width, data.height),
-        params=pinhole_params(k),
+        params=pinhole_params(k, what=f"{source}: camera_intrinsic"),
         rig_from_cam=calibration.matrix(),
         source=source,
     )

@@ -19,6 +19,7 @@ from schemas import BodyAxes, Camera, Gnss, GnssSample, LabelMap
 # Calibrations made with OpenCV's tools put the origin at the centre of the top left pixel; manifests, as COLMAP, at its
 # corner. The principal point moves by this, focal length and distortion are the same in both.
 PIXEL_CENTER_PX = 0.5
+MAX_SKEW = 1e-4  # of the focal length: it moves no pixel of a usual image by more than a tenth
 LAST_ROW_ERROR = 1e-6  # of a 3x3 or 4x4 matrix: those rows are constants, which rounding hardly touches
 
 T = TypeVar("T")
@@ -100,9 +101,61 @@ def choose_scene(scenes: Mapping[str, T], wanted: str | None, folder: Path) -> T
     return scenes[name]
 
 
-def pinhole_params(k: Floats) -> list[float]:
-    """COLMAP's PINHOLE parameters of a calibration matrix (3, 3) that puts the origin at the first pixel's centre."""
+def pinhole_params(k: Floats, *, what: str) -> list[float]:
+    """COLMAP's PINHOLE parameters of a calibration matrix (3, 3) that puts the origin at the first pixel's centre.
+
+    Parameters
+    ----------
+    what
+        What it is and where it stands, for messages.
+
+    Raises
+    ------
+    InputError
+        If it is no calibration matrix without skew.
+    """
+    require_calibration_matrix(k, what=what)
     return [float(v) for v in (k[0, 0], k[1, 1], k[0, 2] + PIXEL_CENTER_PX, k[1, 2] + PIXEL_CENTER_PX)]
+
+
+def require_calibration_matrix(k: Floats, *, what: str) -> None:
+    """Refuse a matrix (3, 3) that is not fx, 0, cx; 0, fy, cy; 0, 0, 1: no camera model here has a skew.
+
+    Raises
+    ------
+    InputError
+        That names the entries at fault. Focal lengths and principal point are the camera's to check.
+    """
+    rows = "Give it row by row as fx, 0, cx; 0, fy, cy; 0, 0, 1"
+    if abs(k[2] - (0, 0, 1)).max() > LAST_ROW_ERROR:
+        raise InputError(
+            f"{what} is no calibration matrix: the last row is {', '.join(f'{value:g}' for value in k[2])} instead of "
+            "0, 0, 1",
+            remedy=f"{rows}: is it transposed, or times a factor?",
+            code="bad-calibration",
+        )
+    if max(abs(k[0, 1]), abs(k[1, 0])) > MAX_SKEW * abs(k[0, 0]):
+        raise InputError(
+            f"{what} is no calibration matrix without skew: beside its focal lengths are {k[0, 1]:g} and {k[1, 0]:g}",
+            remedy=f"{rows}, of images that are rectified or a lens model without skew.",
+            code="bad-calibration",
+        )
+
+
+def pose_of_projection(projection: Floats, *, what: str) -> Floats:
+    """The `cam_from_reference` (4, 4) of a rectified camera's projection (3, 4) of its reference camera's coordinates.
+
+    Raises
+    ------
+    InputError
+        If it does not begin with a calibration matrix.
+    """
+    require_calibration_matrix(projection[:, :3], what=what)
+    if projection[0, 0] * projection[1, 1] == 0.0:
+        raise InputError(
+            f"{what} has a focal length of 0", remedy="Give the calibration's own file.", code="bad-calibration"
+        )
+    return se3.transform(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
 
 
 def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> list[Floats | None]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -19,6 +20,7 @@ from mrasfm_engine.importers.recording import (
     proper_transform,
 )
 from mrasfm_engine.importers.tables import read_poses, read_times
+from mrasfm_engine.importers.unknown_fields import notes_of_unknown_fields
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.io.image_header import read_header
@@ -36,8 +38,12 @@ _Row3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 _Row4 = Annotated[list[Finite], Field(min_length=4, max_length=4)]
 
 
+# Fields of a manifest's camera that a `rig.json` has in the same form: they become the manifest's.
+MANIFEST_FIELDS = frozenset(name for name in Camera.model_fields if name.startswith(("sigma_", "readout_")))
+
+
 class _RigCamera(BaseModel):
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     model: str = "PINHOLE"
     width: int
@@ -54,15 +60,30 @@ class _RigCamera(BaseModel):
             raise ValueError("give 'K' or 'params', not both")
         return self
 
+    @property
+    def declared(self) -> dict[str, Any]:
+        """Fields of the manifest's camera; the manifest checks their values."""
+        given = self.model_extra or {}
+        return {name: value for name, value in given.items() if name in MANIFEST_FIELDS and value is not None}
+
 
 class RigFile(BaseModel):
     """A `rig.json`."""
 
-    model_config = ConfigDict(extra="ignore")
+    model_config = ConfigDict(extra="allow")
 
     body_axes: BodyAxes
     vehicle: Vehicle | None = None
     cameras: Annotated[dict[Name, _RigCamera], Field(min_length=1, max_length=MAX_CAMERAS)]
+
+    def notes(self, file: Path) -> list[str]:
+        """Notes on fields that are not read."""
+        of_cameras = {name for camera in self.cameras.values() for name in camera.model_extra or ()}
+        known = {*_RigCamera.model_fields, *MANIFEST_FIELDS}
+        return [
+            *notes_of_unknown_fields(file.name, self.model_extra or (), known=RigFile.model_fields),
+            *notes_of_unknown_fields(f"{file.name}: cameras", sorted(of_cameras - known), known=known),
+        ]
 
 
 def recognises(folder: Path) -> bool:
@@ -116,6 +137,7 @@ def read(folder: Path) -> Recording:
         vehicle=rig.vehicle,
         default_gnss=gnss if gnss.exists() else None,
         label_map=LabelMap.cityscapes() if any(masks.values()) else None,
+        notes=rig.notes(folder / "rig.json"),
     )
 
 
@@ -133,20 +155,31 @@ def read_rig(file: Path) -> tuple[list[Camera], RigFile]:
 
 
 def _camera(name: str, camera: _RigCamera, flu_body: Floats, rig_file: Path) -> Camera:
-    body_cam = proper_transform(np.array(camera.T_body_cam), what=f"{rig_file}: cameras.{name}.T_body_cam")
+    source = f"{rig_file}: cameras.{name}"
+    given = camera.params
+    if given is None:  # those that are given are COLMAP's, in COLMAP's convention
+        given = pinhole_params(np.array(camera.K), what=f"{source}.K")
+    body_cam = proper_transform(np.array(camera.T_body_cam), what=f"{source}.T_body_cam")
     return checked_camera(
         name,
         model=camera.model,
         size=(camera.width, camera.height),
-        # Those that are given are COLMAP's, in COLMAP's convention.
-        params=pinhole_params(np.array(camera.K)) if camera.params is None else camera.params,
+        params=given,
         rig_from_cam=flu_body @ body_cam,
-        source=f"{rig_file}: cameras.{name}",
+        source=source,
+        declared=camera.declared,
     )
 
 
 def checked_camera(
-    name: str, *, model: str, size: tuple[int, int], params: list[float], rig_from_cam: Floats, source: str
+    name: str,
+    *,
+    model: str,
+    size: tuple[int, int],
+    params: list[float],
+    rig_from_cam: Floats,
+    source: str,
+    declared: Mapping[str, Any] | None = None,
 ) -> Camera:
     """A manifest's camera, whose errors name where the calibration comes from.
 
@@ -156,6 +189,8 @@ def checked_camera(
         Width and height in pixels.
     params
         In COLMAP's order and convention.
+    declared
+        Further fields of the camera, such as standard deviations.
 
     Raises
     ------
@@ -170,6 +205,7 @@ def checked_camera(
             height=size[1],
             params=params,
             rig_from_cam=pose_from_matrix(rig_from_cam),
+            **(declared or {}),
         )
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
@@ -193,7 +229,7 @@ def pinhole_camera(name: str, images: dict[int, Path], k: Floats, rig_from_cam: 
         name,
         model="PINHOLE",
         size=(header.width, header.height),
-        params=pinhole_params(k),
+        params=pinhole_params(k, what=source),
         rig_from_cam=rig_from_cam,
         source=source,
     )

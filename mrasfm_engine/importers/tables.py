@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.recording import proper_transform
+from mrasfm_engine.importers.unknown_fields import notes_of_unknown_fields
 from mrasfm_engine.io.documents import read_bytes, read_document
 from mrasfm_engine.types import Floats
 from schemas import GnssSample
@@ -187,13 +188,13 @@ def _value(text: str, column: str, *, where: str) -> float:
 
 
 class _Antenna(BaseModel):
-    model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
 
     antenna_in_body_m: Vector3
 
 
-def read_antenna(path: Path) -> Floats:
-    """Position (3,) of the antenna in the recording's body axes.
+def read_antenna(path: Path) -> tuple[Floats, list[str]]:
+    """Position (3,) of the antenna in the recording's body axes, and notes on fields that are not read.
 
     Raises
     ------
@@ -206,4 +207,6 @@ def read_antenna(path: Path) -> Floats:
             remedy='Write it, as {"antenna_in_body_m": [x, y, z]} in the body axes of the calibration.',
             code="missing-antenna",
         )
-    return np.array(read_document(path, _Antenna, what="antenna position").antenna_in_body_m)
+    antenna = read_document(path, _Antenna, what="antenna position")
+    unknown = antenna.model_extra or ()
+    return np.array(antenna.antenna_in_body_m), notes_of_unknown_fields(path.name, unknown, known=_Antenna.model_fields)

@@ -1,4 +1,4 @@
-"""Lens models that do not reach over their whole image."""
+"""Lens models that do not fit their image: without rays for parts of it, or with an axis at its edge."""
 
 from __future__ import annotations
 
@@ -6,15 +6,22 @@ import numpy as np
 
 from mrasfm_engine.geometry.camera_model import largest_angle_rad, pack_camera, project_points, unproject_pixels
 from schemas import Camera, DriveManifest
+from schemas.drive import CAMERA_MODELS
 from schemas.findings import Finding, error, warning
 
 GRID = 65  # pixels across and down an image that are looked at
 COMES_BACK_PX = 0.01
 USELESS_SHARE = 0.9  # of an image without rays: what is left is the calibration of another camera, or none
+EDGE = 0.1  # of the image's side: no sensor is mounted so far beside its lens, and images are seldom cut so far
 FULL_CIRCLE_RAD = np.radians(90.0)  # lenses that reach farther show an image circle: its corners are dark
 
 
 def lens_findings(manifest: DriveManifest) -> list[Finding]:
+    """Find the cameras whose lens model does not fit their image."""
+    return [*_folding(manifest), *_off_center(manifest)]
+
+
+def _folding(manifest: DriveManifest) -> list[Finding]:
     """Find the cameras whose distortion folds back inside the image: no ray leads to the pixels beyond."""
     found = []
     for camera in manifest.rig.cameras:
@@ -28,6 +35,25 @@ def lens_findings(manifest: DriveManifest) -> list[Finding]:
                     "seen there takes no part",
                     "Check the order and signs of params; calibrate with views that reach the image's corners, or "
                     "with a model for wide lenses.",
+                )
+            )
+    return found
+
+
+def _off_center(manifest: DriveManifest) -> list[Finding]:
+    """Find the cameras whose principal point is near an edge of the image: of an image that is cut, or a slip."""
+    found = []
+    for camera in manifest.rig.cameras:
+        values = dict(zip(CAMERA_MODELS[camera.model], camera.params, strict=True))
+        at = np.array([values["cx"] / camera.width, values["cy"] / camera.height])
+        if (np.abs(at - 0.5) > 0.5 - EDGE).any():
+            found.append(
+                warning(
+                    "principal-point",
+                    f"rig.cameras: the principal point of camera {camera.name} is ({values['cx']:g}, "
+                    f"{values['cy']:g}), at the edge of its image of {camera.width}x{camera.height} pixels",
+                    "Check the order and the size of params: cx and cy are about half of width and height, except in "
+                    "images that are cut out of larger ones.",
                 )
             )
     return found

@@ -226,6 +226,7 @@ def test_distortion(tmp_path: Path, info: dict[str, Any], model: str, params: li
         ({"model": "rational_polynomial", "D": [0.1] * 12}, "has terms of a thin prism"),
         ({"D": [np.nan] * 5}, "coefficient of distortion is not finite"),
         ({"K": np.zeros((3, 3))}, "/left/camera_info: K is not set: the camera is not calibrated"),
+        ({"K": np.transpose(K)}, "/left/camera_info: K is no calibration matrix: the last row is 23.5, 15.5, 1"),
         ({"size": (96, 64)}, "calibration is of images of 96x64 pixels, those of the bag have 48x32"),
     ],
 )
@@ -654,6 +655,13 @@ def test_a_chain_that_does_not_fit_is_refused(tmp_path: Path, old: str, new: str
     assert message in refused(stereo(), tmp_path, calibration=tmp_path / "camchain.yaml")
 
 
+def test_a_time_shift_of_the_chain_is_noted(tmp_path: Path) -> None:
+    text = camchain(se3.transform(np.eye(3), [-0.5, 0, 0]))
+    (tmp_path / "camchain.yaml").write_text(text.replace("cam0:\n", "cam0:\n  timeshift_cam_imu: 0.033\n"))
+    _, summary = imported(stereo(), tmp_path, calibration=tmp_path / "camchain.yaml")
+    assert any("timeshift_cam_imu is not applied: cam0 (0.033 s)." in note for note in summary.notes)
+
+
 def test_a_transposed_chain_is_refused(tmp_path: Path) -> None:
     right_from_left = se3.transform(np.eye(3), [-0.5, 0, 0])
     (tmp_path / "camchain.yaml").write_text(camchain(right_from_left.T))
@@ -664,9 +672,10 @@ def test_a_transposed_chain_is_refused(tmp_path: Path) -> None:
 
 def test_a_rig_file_replaces_camera_info_and_transforms(tmp_path: Path) -> None:
     poses = {"left": LEFT, "right": RIGHT}
-    cameras = {
+    cameras: dict[str, Any] = {
         name: {"width": SIZE[0], "height": SIZE[1], "K": K, "T_body_cam": pose.tolist()} for name, pose in poses.items()
     }
+    cameras["left"]["readout"] = 30_000
     (tmp_path / "rig.json").write_text(json.dumps({"body_axes": "flu", "cameras": cameras}))
     made = stereo()
     for topic in (STATIC, "/left/camera_info", "/right/camera_info"):
@@ -674,7 +683,8 @@ def test_a_rig_file_replaces_camera_info_and_transforms(tmp_path: Path) -> None:
     options = {"calibration": tmp_path / "rig.json"}
     assert "--antenna" in refused(made, tmp_path, **options)
     (tmp_path / "second").mkdir()
-    drive, _ = imported(made, tmp_path / "second", **options, antenna_m=[0, 0, 2])
+    drive, summary = imported(made, tmp_path / "second", **options, antenna_m=[0, 0, 2])
+    assert "rig.json: cameras: not known, and not read: readout (is it readout_us?)." in summary.notes
     np.testing.assert_allclose(drive.rig_from_cam, [LEFT, RIGHT], atol=1e-12)
     del cameras["right"]
     (tmp_path / "rig.json").write_text(json.dumps({"body_axes": "flu", "cameras": cameras}))

@@ -276,6 +276,66 @@ def test_a_transposed_pose_is_refused(recording: Path, tmp_path: Path) -> None:
     assert read_drive(tmp_path / "drive").rig_from_cam[1][1, 3] == pytest.approx(-0.5)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda k: 2 * k, "the last row is 0, 0, 2 instead of 0, 0, 1"),
+        (np.transpose, "the last row is 23.5, 15.5, 1 instead of 0, 0, 1"),
+        (lambda k: k + np.outer([12.0, 0, 0], [0, 1, 0]), "beside its focal lengths are 12 and 0"),
+    ],
+    ids=["times a factor", "transposed", "skew"],
+)
+def test_matrices_that_are_no_calibration(
+    recording: Path, tmp_path: Path, change: Callable[[np.ndarray], np.ndarray], message: str
+) -> None:
+    def alter(document: dict[str, Any]) -> None:
+        camera = document["cameras"]["cam_r"]
+        camera["K"] = change(np.array(camera["K"])).tolist()
+
+    edit_rig(recording, alter)
+    error = refused(recording, tmp_path / "drive")
+    assert "rig.json: cameras.cam_r.K is no calibration matrix" in error.what
+    assert message in error.what
+
+
+def test_a_skew_of_rounding_is_none(recording: Path, tmp_path: Path) -> None:
+    edit_rig(recording, lambda document: document["cameras"]["cam_r"]["K"][0].__setitem__(1, 1e-5))
+    import_recording(recording, tmp_path / "drive")
+    assert read_drive(tmp_path / "drive").cameras[1].params == [40.0, 41.0, 24.0, 16.0]
+
+
+def test_fields_of_the_manifest_in_the_rig(recording: Path, tmp_path: Path) -> None:
+    """Standard deviations and the shutter's times are read as the manifest has them."""
+    given = {"sigma_rotation_deg": 0.01, "sigma_translation_m": 0.001, "readout_us": 30_000, "sigma_distortion": 0.01}
+    edit_rig(recording, lambda document: document["cameras"]["cam_r"].update(given, readout_direction="top_to_bottom"))
+    summary = import_recording(recording, tmp_path / "drive")
+    assert summary.notes == []
+    manifest = read_drive(tmp_path / "drive").manifest
+    assert manifest.version == 2
+    assert {name: getattr(manifest.rig.cameras[1], name) for name in given} == given
+    assert manifest.rig.cameras[0].sigma_rotation_deg is None
+    edit_rig(recording, lambda document: document["cameras"]["cam_r"].update(readout_us=-1))
+    assert "rig.json: cameras.cam_r: readout_us" in refused(recording, tmp_path / "other").what
+
+
+def test_unknown_fields_are_noted(recording: Path, tmp_path: Path) -> None:
+    def add(document: dict[str, Any]) -> None:
+        document["body_axis"] = "flu"
+        for camera in document["cameras"].values():
+            camera.update(D=[-0.3, 0.1, 0, 0], sigma_rot=0.1, comment="no field")
+
+    edit_rig(recording, add)
+    (recording / "gnss_antenna.json").write_text('{"antenna_in_body_m": [0.3, -1.5, 0.1], "units": "cm"}')
+    notes = import_recording(recording, tmp_path / "drive").notes
+    assert notes == [
+        "rig.json: not known, and not read: body_axis (is it body_axes?).",
+        "rig.json: cameras: not known, and not read: D, sigma_rot (is it sigma_rotation_deg?). "
+        "Distortion is read from 'model' and 'params' alone.",
+        "gnss_antenna.json: not known, and not read: units.",
+    ]
+    assert read_drive(tmp_path / "drive").manifest.notes == notes
+
+
 def test_other_camera_models_come_with_their_parameters(recording: Path, tmp_path: Path) -> None:
     params = [40.0, 41.0, 24.0, 16.0, 0.01, 0.0, 0.0, 0.0]
 

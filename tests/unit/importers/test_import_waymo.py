@@ -141,7 +141,18 @@ def changed(folder: Path, kind: str, **columns: Any) -> None:
         ("camera_image", "camera_readout_done_time", lambda v: [v[0] + 0.01, *v[1:]], "camera front: images are read"),
         ("camera_image", "camera_name", lambda v: [9, *v[1:]], "camera 9 is not known"),
         ("camera_image", ".image", lambda v: [b"none", *v[1:]], "is neither a JPEG nor a PNG"),
-        ("camera_image", "pose.transform", lambda v: [[1.0] * 16, *v[1:]], r"row 0: .*pose\.transform is not a rigid"),
+        (
+            "camera_image",
+            "pose.transform",
+            lambda v: [[1.0] * 12 + [0.0] * 3 + [1.0], *v[1:]],
+            r"row 0: .*pose\.transform is not a rigid",
+        ),
+        (
+            "camera_image",
+            "pose.transform",
+            lambda v: [[1.0] * 16, *v[1:]],
+            r"row 0: .*pose\.transform: the fourth row is",
+        ),
         (
             "camera_calibration",
             "width",

@@ -42,6 +42,21 @@ def test_lenses_that_reach_the_corners_are_no_finding(model: str, params: list[f
     assert findings(model, params) == []
 
 
+@pytest.mark.parametrize(
+    ("center", "is_named"),
+    [
+        ((480.0, 300.0), False),
+        ((480.0, 140.0), False),
+        ((480.0, 40.0), True),
+        ((940.0, 300.0), True),
+        ((0.5, 0.5), True),
+    ],
+)
+def test_a_principal_point_at_the_edge_is_named(center: tuple[float, float], is_named: bool) -> None:
+    found = findings("PINHOLE", [500.0, 500.0, *center])
+    assert [text.split(":")[0] for text in found] == (["principal-point"] if is_named else [])
+
+
 def test_a_fold_inside_the_image_is_named_with_its_angle_and_share() -> None:
     # Half of the image is 43 deg wide, the polynomial ends at 31 deg.
     params = [500.0, 500.0, 480.0, 300.0, -0.9, 0.0, 0.0, 0.0]
