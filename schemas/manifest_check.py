@@ -29,6 +29,8 @@ from schemas.parsing import DocumentError, parse_manifest
 MAX_UNSYNCHRONISED_US = 60_000  # nuScenes' cameras are up to 50 ms apart
 MIN_FRAME_INTERVAL_US = 1_000
 MAX_FRAME_INTERVAL_US = 20_000_000
+USUAL_INTERVAL_US = 100_000
+OTHER_UNITS_US = {"nanoseconds": 1e-3, "milliseconds": 1e3, "seconds": 1e6}
 MAX_CAMERA_ROLL_DEG = 60.0
 
 _UP_IN_BODY = {BodyAxes.FLU: (0, 0, 1), BodyAxes.RDF: (0, -1, 0), BodyAxes.FRD: (0, 0, -1)}
@@ -135,21 +137,24 @@ def _check_frames(recorded: _Recorded) -> list[Finding]:
 def _check_times(recorded: _Recorded) -> list[Finding]:
     findings = []
     if len(recorded.timestamps_us) > 1:
-        median = float(np.median(np.diff(recorded.timestamps_us)))
-        unit = ""
-        if median < MIN_FRAME_INTERVAL_US:
-            unit = "milliseconds"
-        elif median > MAX_FRAME_INTERVAL_US:
-            unit = "nanoseconds"
-        if unit:
+        median_us = float(np.median(np.diff(recorded.timestamps_us)))
+        if not MIN_FRAME_INTERVAL_US <= median_us <= MAX_FRAME_INTERVAL_US:
             findings.append(
                 error(
                     "frame-rate",
-                    f"frames are {median / 1e6:g} s apart: their timestamps look like {unit}",
+                    f"frames are {median_us / 1e6:g} s apart: their timestamps {_complaint_of(median_us)}",
                     "Give frames.timestamp_us in microseconds, and the samples of gnss and rough_poses too.",
                 )
             )
     return [*findings, *_check_synchronisation(recorded)]
+
+
+def _complaint_of(median: float) -> str:
+    """The unit in which frames that are so far apart have the most usual rate, if there is one."""
+    intervals_us = {unit: median * each_us for unit, each_us in OTHER_UNITS_US.items()}
+    unit = min(intervals_us, key=lambda name: abs(math.log(max(intervals_us[name], 1e-9) / USUAL_INTERVAL_US)))
+    usual = MIN_FRAME_INTERVAL_US <= intervals_us[unit] <= MAX_FRAME_INTERVAL_US
+    return f"look like {unit}" if usual else "are not microseconds"
 
 
 def _check_synchronisation(recorded: _Recorded) -> list[Finding]:

@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from mrasfm_engine.errors import InputError, storage_error
-from mrasfm_engine.importers.recording import ImageKey, Recording, SourceImage
+from mrasfm_engine.importers.recording import ImageKey, Recording, SourceImage, SourceUnit
 from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, write_manifest
 from mrasfm_engine.scene.drive import pose_from_matrix
@@ -168,26 +168,18 @@ def _write_contents(recording: Recording, targets: dict[ImageKey, Path]) -> None
 
 
 def _manifest(recording: Recording) -> DriveManifest:
-    rough = [
-        RoughPose(timestamp_us=unit.timestamp_us, world_from_rig=pose_from_matrix(unit.rough_world_from_rig))
-        for unit in recording.units
-        if unit.rough_world_from_rig is not None
-    ]
-    frames = [
-        Frame(
-            timestamp_us=unit.timestamp_us,
-            source_frame=unit.source_frame,
-            images={name: _frame_image(name, unit.source_frame, image) for name, image in unit.images.items()},
-        )
-        for unit in recording.units
-    ]
     try:
+        rough = [
+            RoughPose(timestamp_us=unit.timestamp_us, world_from_rig=pose_from_matrix(unit.rough_world_from_rig))
+            for unit in recording.units
+            if unit.rough_world_from_rig is not None
+        ]
         manifest = DriveManifest(
             version=2 if _needs_version_2(recording) else 1,
             **({} if recording.vehicle is None else {"vehicle": recording.vehicle}),
             name=recording.name,
             rig=Rig(cameras=recording.cameras),
-            frames=frames,
+            frames=[_frame(unit) for unit in recording.units],
             gnss=recording.gnss,
             rough_poses=_trajectory(recording, rough) if rough else None,
             label_map=recording.label_map,
@@ -196,6 +188,8 @@ def _manifest(recording: Recording) -> DriveManifest:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         what = ": ".join([*map(str, first["loc"]), str(first["msg"]).removeprefix("Value error, ")])
+        if isinstance(first["input"], int | float):
+            what = f"{what} (is {first['input']})"
         raise InputError(f"recording {recording.name}: {what}", remedy="Correct it at its source.") from None
     for problem in file_problems(manifest):
         what = f"the drive's file {problem.path} {problem.what}"
@@ -214,6 +208,14 @@ def _trajectory(recording: Recording, poses: list[RoughPose]) -> RoughTrajectory
         {} if quality is None else {"sigma_translation_m": quality.sigma_m, "sigma_rotation_deg": quality.sigma_deg}
     )
     return RoughTrajectory(poses=poses, common_world=recording.common_world, **sigmas)
+
+
+def _frame(unit: SourceUnit) -> Frame:
+    return Frame(
+        timestamp_us=unit.timestamp_us,
+        source_frame=unit.source_frame,
+        images={name: _frame_image(name, unit.source_frame, image) for name, image in unit.images.items()},
+    )
 
 
 def _frame_image(camera: str, frame: int, image: SourceImage) -> FrameImage:

@@ -15,6 +15,7 @@ from mrasfm_engine.io.documents import read_bytes, read_document
 from mrasfm_engine.types import Floats
 from schemas import GnssSample
 from schemas.drive import MAX_GNSS_SAMPLES, Vector3
+from schemas.manifest_check import MAX_FRAME_INTERVAL_US
 
 GNSS_COLUMNS = (
     "timestamp_us",
@@ -24,6 +25,8 @@ GNSS_COLUMNS = (
     "sigma_horizontal_m",
     "sigma_vertical_m",
 )
+MAX_TIME_S = 1e11  # since 1970: milliseconds are beyond this since 1973, seconds will be in three thousand years
+_SMALLER_UNITS = {"milliseconds": 1e-3, "microseconds": 1e-6, "nanoseconds": 1e-9}
 ANTENNA_FILE = "gnss_antenna.json"
 
 
@@ -92,7 +95,7 @@ def read_times(path: Path, *, frames: list[int]) -> list[int]:
     Raises
     ------
     InputError
-        If a frame has no line, or the times do not increase.
+        If a frame has no line, the times do not increase, or they are in another unit.
     """
     seconds = read_numbers(path, what="times", columns=1)[:, 0]
     if max(frames) >= len(seconds):
@@ -101,6 +104,7 @@ def read_times(path: Path, *, frames: list[int]) -> list[int]:
             remedy="Give one time for every frame, counted from 0.",
             code="missing-times",
         )
+    _require_seconds(seconds, frames, path)
     times_us = [round(float(seconds[f]) * 1e6) for f in frames]
     for before, after, frame in zip(times_us[:-1], times_us[1:], frames[1:], strict=True):
         if after <= before:
@@ -112,6 +116,27 @@ def read_times(path: Path, *, frames: list[int]) -> list[int]:
     if times_us[0] < 0:
         raise InputError(f"times {path} has negative times", remedy="Give times in seconds from 0 on.")
     return times_us
+
+
+def _require_seconds(seconds: Floats, frames: list[int], path: Path) -> None:
+    """Refuse times whose steps are too long for a drive, or that are beyond any date: they are in a smaller unit."""
+    longest_s = MAX_FRAME_INTERVAL_US / 1e6
+    steps_s = np.diff(seconds[frames])
+    median_s = float(np.median(steps_s)) if len(steps_s) else 0.0
+    largest = int(np.argmax(np.abs(seconds)))
+    if median_s > longest_s:
+        line, what = frames[1], f"frames are {median_s:g} s apart"
+        fitting = (unit for unit, each_s in _SMALLER_UNITS.items() if median_s * each_s <= longest_s)
+    elif abs(seconds[largest]) > MAX_TIME_S:
+        line, what = largest, f"{seconds[largest]:.0f} is no time in seconds"
+        fitting = (unit for unit, each_s in _SMALLER_UNITS.items() if abs(seconds[largest]) * each_s <= MAX_TIME_S)
+    else:
+        return
+    raise InputError(
+        f"times {path}, line {line + 1}: {what}: they look like {next(fitting, 'another unit')}",
+        remedy="Give times in seconds, one on every line, such as 0.1 or 1714730400.1.",
+        code="bad-times",
+    )
 
 
 def read_gnss_csv(path: Path) -> list[GnssSample]:

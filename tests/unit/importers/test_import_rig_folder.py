@@ -17,7 +17,7 @@ from mrasfm_engine.commands import import_drive
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.importers import drive_writer
 from mrasfm_engine.importers.layouts import import_recording
-from mrasfm_engine.importers.recording import parse_slice
+from mrasfm_engine.importers.recording import Recording, SourceUnit, parse_slice
 from mrasfm_engine.preflight.drive_reader import check_drive, read_drive
 
 HEADER = "timestamp_us,latitude_deg,longitude_deg,ellipsoidal_height_m,sigma_horizontal_m,sigma_vertical_m"
@@ -398,6 +398,30 @@ def test_times_are_rounded_to_microseconds(recording: Path, tmp_path: Path) -> N
     times = read_drive(tmp_path / "drive").timestamps_us
     assert times[:2].tolist() == [103612, 1103612]
     assert times[-1] == 1234567890123457
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("milliseconds", 10**3), ("microseconds", 10**6), ("nanoseconds", 10**9)])
+@pytest.mark.parametrize("start_s", [0, 1_714_730_400])
+def test_times_in_another_unit(recording: Path, tmp_path: Path, unit: str, factor: int, start_s: int) -> None:
+    times = [start_s * factor + i * factor // 10 for i in range(8)]
+    (recording / "times.txt").write_text("".join(f"{time}\n" for time in times))
+    error = refused(recording, tmp_path / "drive")
+    assert f"times.txt, line 2: frames are {factor / 10:g} s apart: they look like {unit}" in error.what
+    assert "in seconds" in error.remedy
+
+
+def test_a_time_beyond_any_date(recording: Path, tmp_path: Path) -> None:
+    (recording / "times.txt").write_text("".join(f"{0.1 * i if i < 5 else 1.7e15 + 100 * i}\n" for i in range(8)))
+    assert "times.txt, line 8: 1700000000000700 is no time in seconds" in refused(recording, tmp_path / "drive").what
+
+
+def test_values_that_no_manifest_has_are_named(recording: Path, tmp_path: Path) -> None:
+    """A frame's defect is an error as any other, whatever the importer has let through."""
+    import_recording(recording, tmp_path / "first")
+    unit = SourceUnit(source_frame=0, timestamp_us=2**63, images={})
+    made = Recording(layout="a test", name="made", cameras=read_drive(tmp_path / "first").cameras, units=[unit])
+    with pytest.raises(InputError, match=r"recording made: timestamp_us: .*9223372036854775808"):
+        drive_writer.write_recording(made, tmp_path / "drive")
 
 
 @pytest.mark.parametrize("world", ["rdf", "z up"])

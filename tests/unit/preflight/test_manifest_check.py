@@ -91,6 +91,23 @@ def test_gnss_that_is_not_used_is_not_checked(drive_document: Document) -> None:
     assert parsed(drive_document, use_gnss=False) == []
 
 
+@pytest.mark.parametrize(
+    ("step_us", "complaint"),
+    [
+        (1, "look like seconds"),
+        (100, "look like milliseconds"),
+        (10**8, "look like nanoseconds"),
+        (10**11, "are not microseconds"),
+    ],
+)
+def test_units_of_timestamps(drive_document: Document, step_us: int, complaint: str) -> None:
+    for i, frame in enumerate(drive_document["frames"]):
+        frame["timestamp_us"] = 10**12 + i * step_us
+    (finding,) = parsed(drive_document, use_gnss=False)
+    assert finding.code == "frame-rate"
+    assert finding.what.endswith(f"their timestamps {complaint}")
+
+
 def placed(d: Document, *positions_m: list[float], sigma_m: float | None = None) -> None:
     for camera, position_m in zip(d["rig"]["cameras"], positions_m, strict=True):
         camera["rig_from_cam"]["translation_m"] = position_m
