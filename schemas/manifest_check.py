@@ -196,8 +196,8 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
         return []
     what = f"camera {listed(turned)} is turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
     remedy = (
-        "Check rig.body_axes and that rig_from_cam is the camera's pose in the rig, not its inverse; camera axes are "
-        "x right, y down, z forward."
+        "Check rig.body_axes, that rig_from_cam is the camera's pose in the rig, not its inverse, and that its "
+        "quaternion ends with w; camera axes are x right, y down, z forward."
     )
     if len(turned) == len(manifest.rig.cameras):
         return [error("rig-axes", what, remedy)]

@@ -1,8 +1,9 @@
-"""Check on the first units, before the long work, that `rig_from_cam` is not given as its inverse."""
+"""Check on the first units, before the long work, that `rig_from_cam` is given the right way round."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from enum import Enum
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.io.axes import flu_from_body
+from mrasfm_engine.io.axes import flu_from_body as flu_from_axes
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.verification import (
     epipolar_errors,
@@ -28,18 +29,33 @@ MIN_INLIERS = 50
 MIN_PARALLAX_RAD = np.radians(0.3)  # about 3 px at a focal length of 600 px
 MOTION_ERROR = 2e-3  # of a match between two units, in the plane z = 1
 PAIR_ERROR_PX = 4.0  # from the epipolar line of a calibration that is the right way round
-CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of the inverse, and of what was given, for a verdict
+CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of another reading, and of what was given, for a verdict
 MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
+
+
+class _Reading(Enum):
+    """Another pose that the numbers of `rig_from_cam` may have meant: name, code and remedy."""
+
+    INVERSE = (
+        "its inverse, cam_from_rig",
+        "calibration-inverted",
+        "Give the camera's pose in the rig: its translation is where the camera sits on the vehicle.",
+    )
+    QUATERNION_ORDER = (
+        "a pose with its quaternion in the order w, x, y, z",
+        "quaternion-order",
+        "Give rotation_xyzw in the order x, y, z, w.",
+    )
 
 
 def require_calibration_direction(
     drive: Drive, images: Sequence[int], features: Sequence[ImageFeatures], matcher: Matcher, config: MatchConfig
 ) -> None:
-    """Refuse a rig whose inverse explains the images clearly better.
+    """Refuse a rig whose inverse, or whose quaternions in another order, explain the images clearly better.
 
     Two signs are looked for. All cameras must find the car moving in one direction of the rig; under the inverse of
     differently turned cameras they don't. And matches between cameras of one unit must lie near their epipolar lines
-    and in front of both cameras; with the baseline reversed they don't. The inverse may have been taken in any axes
+    and in front of both cameras; with the baseline reversed they don't. The numbers may have been written in any axes
     that a manifest can have, before they became the engine's.
 
     Parameters
@@ -50,7 +66,7 @@ def require_calibration_direction(
     Raises
     ------
     InputError
-        Where the calibration is the wrong way round.
+        Where the calibration is the wrong way round, or its quaternions are in another order.
     """
     kinds, params = pack_cameras(drive.cameras)
     cameras = [drive.cameras[drive.images[i].camera] for i in images]
@@ -59,7 +75,8 @@ def require_calibration_direction(
         unproject_pixels(int(kinds[drive.images[i].camera]), params[drive.images[i].camera], f.xy_px)
         for i, f in zip(images, features, strict=True)
     ]
-    rigs = [drive.rig_from_cam, *_inverses(drive.rig_from_cam)]
+    readings = [*_readings(drive.rig_from_cam)]
+    rigs = [drive.rig_from_cam, *(rig for _, rig in readings)]
     where = {(drive.images[i].unit, drive.images[i].camera): k for k, i in enumerate(images)}
 
     def verified(a: int, b: int) -> tuple[Floats, Floats] | None:
@@ -81,16 +98,27 @@ def require_calibration_direction(
                 by_depth.append([share_explained(rig[ca], rig[cb], *found, gate) for rig in rigs])
     for evidence in (by_motion, by_depth):
         if len(evidence) >= MIN_EVIDENCE:
-            given_ok, *inverse = np.median(np.array(evidence), axis=0)
-            inverse_ok = max(inverse)
-            if inverse_ok > CLEARLY_BETTER and given_ok < CLEARLY_WORSE:
-                raise InputError(
-                    "rig.cameras: rig_from_cam looks like its inverse, cam_from_rig: the first units agree "
-                    f"{inverse_ok:.0%} with the inverse and {given_ok:.0%} with what is given",
-                    remedy="Give the camera's pose in the rig: its translation is where the camera sits on the "
-                    "vehicle. Check as well that no two cameras' images are swapped.",
-                    code="calibration-inverted",
+            given_ok, *others_ok = np.median(np.array(evidence), axis=0)
+            if given_ok < CLEARLY_WORSE:
+                _require_no_better(
+                    float(given_ok), [(float(ok), kind) for ok, (kind, _) in zip(others_ok, readings, strict=True)]
                 )
+
+
+def _require_no_better(given_ok: float, others: Sequence[tuple[float, _Reading]]) -> None:
+    """Refuse what was given where another reading agrees clearly better; of two that do, both are named."""
+    best = {kind: max(ok for ok, other in others if other is kind) for kind in _Reading}
+    better = sorted((kind for kind in best if best[kind] > CLEARLY_BETTER), key=lambda kind: -best[kind])
+    if not better:
+        return
+    name, code, _ = better[0].value
+    remedies = [kind.value[2] for kind in better]
+    raise InputError(
+        f"rig.cameras: rig_from_cam looks like {name}: the first units agree {best[better[0]]:.0%} with that and "
+        f"{given_ok:.0%} with what is given",
+        remedy=f"{' If it is not that: '.join(remedies)} Check as well that no two cameras' images are swapped.",
+        code=code,
+    )
 
 
 def _motion_agreement(
@@ -115,11 +143,14 @@ def _motion_agreement(
     return [float(length) for length in np.linalg.norm(np.array(directions).mean(0), axis=1)]
 
 
-def _inverses(rig_from_cam: Floats) -> list[Floats]:
-    """Poses that were meant, if the inverse was given in forward-left-up, right-down-forward or forward-right-down
-    axes.
-    """
-    return [flu @ se3.inverse(se3.inverse(flu) @ rig_from_cam) for flu in map(flu_from_body, BodyAxes)]
+def _readings(rig_from_cam: Floats) -> Iterator[tuple[_Reading, Floats]]:
+    """Poses that were meant, if the numbers were written in another way, in any axes that a manifest can have."""
+    for flu_from_body in map(flu_from_axes, BodyAxes):
+        given = se3.inverse(flu_from_body) @ rig_from_cam
+        yield _Reading.INVERSE, flu_from_body @ se3.inverse(given)
+        wxyz = se3.quaternion_from_rotation(given[..., :3, :3])
+        meant = se3.rotation_from_quaternion(np.roll(wxyz, -1, axis=-1))
+        yield _Reading.QUATERNION_ORDER, flu_from_body @ se3.transform(meant, given[..., :3, 3])
 
 
 def share_explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> float:

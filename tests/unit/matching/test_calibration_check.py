@@ -1,14 +1,18 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
 from mrasfm_engine.scene.scene import ImageFeatures
+from schemas import BodyAxes
 from tests.helpers.simulated_drive import SimulatedDrive, inverted, make_drive, make_simulated_drive, random_descriptors
 
 UNITS = 4
@@ -40,6 +44,27 @@ def test_an_inverted_calibration_is_refused(cameras: int) -> None:
         check(simulated)
     assert caught.value.code == "calibration-inverted"
     assert "translation" in caught.value.remedy
+
+
+def reordered(rig_from_cam: np.ndarray) -> np.ndarray:
+    """Poses of quaternions w, x, y, z that are read as x, y, z, w."""
+    wxyz = np.roll(se3.quaternion_from_rotation(rig_from_cam[:, :3, :3]), 1, axis=-1)
+    return se3.transform(se3.rotation_from_quaternion(wxyz), rig_from_cam[:, :3, 3])
+
+
+def in_axes_of(flu_from_body: np.ndarray, change: Callable[[np.ndarray], np.ndarray]) -> Callable[..., np.ndarray]:
+    return lambda rig_from_cam: flu_from_body @ change(se3.inverse(flu_from_body) @ rig_from_cam)
+
+
+@pytest.mark.parametrize("axes", BodyAxes)
+@pytest.mark.parametrize("cameras", [2, 6])
+def test_quaternions_in_another_order_are_refused_as_that(cameras: int, axes: BodyAxes) -> None:
+    given = in_axes_of(flu_from_body(axes), reordered)
+    simulated = make_simulated_drive(units=UNITS, cameras=cameras, points=2500, given=given)
+    with pytest.raises(InputError, match="order w, x, y, z") as caught:
+        check(simulated)
+    assert caught.value.code == "quaternion-order"
+    assert "Give rotation_xyzw in the order x, y, z, w." in caught.value.remedy
 
 
 def rectified_stereo(rig_from_cam_given: np.ndarray) -> SimulatedDrive:
