@@ -10,13 +10,20 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mrasfm_engine.errors import InputError
-from schemas.drive import SIGMA_TRANSLATION_M
+from schemas.drive import MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
 from schemas.methods import ExtractorName, MatcherName
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
 Threshold = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Count = Annotated[int, Field(ge=1)]
+# No drive has more frames, cameras and pairs of an image than this; larger numbers are slips, which libraries below the
+# engine would answer with tracebacks.
+MAX_COUNT = 1_000_000
+Count = Annotated[int, Field(ge=1, le=MAX_COUNT)]
+CountOrZero = Annotated[int, Field(ge=0, le=MAX_COUNT)]
+Keypoints = Annotated[int, Field(ge=1, le=100_000)]  # one for every few pixels of any image
+Threads = Annotated[int, Field(ge=1, le=1024)]  # as the service's MRASFM_ENGINE_THREADS
+Pixels = Annotated[int, Field(ge=1, le=MAX_IMAGE_SIDE_PX)]
 
 
 def _available_cores() -> int:
@@ -39,7 +46,7 @@ class FeatureConfig(_Section):
     min_score: Annotated[float, Field(ge=0, le=1)] | None = Field(
         None, description="lowest score of a network's keypoints; by default the model's usual one"
     )
-    max_keypoints: Count = Field(2048, description="per image; 1024 costs accuracy")
+    max_keypoints: Keypoints = Field(2048, description="per image; 1024 costs accuracy")
     spread: bool = Field(
         True,
         description="keypoints are taken all over the image first; `false` takes the strongest",
@@ -50,14 +57,14 @@ class FeatureConfig(_Section):
     contrast_threshold: Positive = Field(
         0.02, description="of SIFT; half of its usual value, so that asphalt and shade yield keypoints too"
     )
-    class_margin_px: Annotated[int, Field(ge=0)] = Field(
+    class_margin_px: CountOrZero = Field(
         2, description="keypoints nearer than this to the border of a class in the mask have no class"
     )
     own_car: bool = Field(
         True,
         description="no keypoints on the vehicle itself, which is found by the edges that stay while it moves",
     )
-    max_side_px: Count | None = Field(
+    max_side_px: Pixels | None = Field(
         None,
         description="larger images are extracted at reduced size; coordinates stay those of the full image; by default "
         "1600, and with `sift` no more than three quarters of `max_keypoints` need",
@@ -75,7 +82,7 @@ class PairConfig(_Section):
     window_units: Count = Field(
         4, description="largest number of following units, spaced by the vehicle's motion, that a unit is matched with"
     )
-    cross_window_units: Annotated[int, Field(ge=0)] = Field(
+    cross_window_units: CountOrZero = Field(
         2, description="without a prior trajectory: the same across cameras that look in similar directions"
     )
     pairs_per_image: Count = Field(16, description="with GNSS or rough poses: the pairs of largest overlap per image")
@@ -84,7 +91,7 @@ class PairConfig(_Section):
     min_overlap: Share = Field(
         0.08, description="smallest share of one image's frustum samples that the other image sees"
     )
-    revisit_pairs_per_unit: Annotated[int, Field(ge=0)] = Field(
+    revisit_pairs_per_unit: CountOrZero = Field(
         3, description="without a prior trajectory: similar units farther along the path"
     )
 
@@ -98,7 +105,7 @@ class MatchConfig(_Section):
     model: str | None = Field(
         None, description="name of the matcher's model; by default the usual one for the extractor"
     )
-    max_keypoints: Count = Field(
+    max_keypoints: Keypoints = Field(
         1024, description="number of an image's first keypoints that a network matches; time grows with its square"
     )
     min_score: Annotated[float, Field(ge=0, le=1)] | None = Field(
@@ -121,10 +128,10 @@ class SubmapConfig(_Section):
     memory_mb: Positive = Field(
         1500.0, description="expected memory of mapping a sub-map besides the program's own; larger drives are cut"
     )
-    overlap_units: Annotated[int, Field(ge=3)] = Field(
+    overlap_units: Annotated[int, Field(ge=3, le=MAX_COUNT)] = Field(
         10, description="units that two neighbouring sub-maps share, which say how one lies to the other"
     )
-    processes: Count | None = Field(
+    processes: Threads | None = Field(
         None,
         description="sub-maps that are done at one time, each in a process with its share of the threads; by default "
         "one for every four threads",
@@ -158,7 +165,7 @@ class MappingConfig(_Section):
     min_pnp_inlier_ratio: Share = Field(0.2, description="of a unit, over all its cameras")
     local_units: Count = Field(6, description="units that vary in local adjustment")
     local_every: Count = Field(3, description="registered units between two local adjustments")
-    pose_observations: Annotated[int, Field(ge=0)] = Field(
+    pose_observations: CountOrZero = Field(
         250, description="observations of an image that its pose uses while the scene grows; 0 uses all"
     )
     drop_moving: bool = Field(
@@ -334,7 +341,7 @@ class EngineConfig(_Section):
     models: ModelsConfig = ModelsConfig()
     use_gnss: bool = Field(True, description="`false` ignores GNSS everywhere")
     seed: Annotated[int, Field(ge=0, lt=2**31)] = Field(0, description="of everything that is drawn at random")
-    threads: Count = Field(
+    threads: Threads = Field(
         default_factory=_available_cores, description="by default one for each core that the process may use"
     )
 
@@ -350,7 +357,7 @@ def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
     values: dict[str, Any] = {}
     if path is not None:
         try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
+            values = tomllib.loads(path.read_text(encoding="utf-8-sig"))  # editors of Windows begin with a mark
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}", remedy="Give an existing file.") from error
         except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
