@@ -78,6 +78,7 @@ def reconstruct(
         # No name for what was mapped: it is most of what stands in memory, and only the refinement needs it.
         scene, components = stages.refinement(run, stages.mapped(run, spans, prior), prior)
         whole, parts = stages.numbered_components(run, *stages.all_units(run, scene, components))
+        stages.record_images(run, whole, parts)
         with scratch_folder(out) as scratch:
 
             def draw() -> PictureFiles:

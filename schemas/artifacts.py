@@ -35,6 +35,7 @@ CHECKPOINT_FOLDER = ".stages"
 CHECKPOINTED = frozenset({Stage.FEATURES, Stage.MATCHES, Stage.MAPPING, Stage.REFINEMENT})
 
 REPORT_FILE = "report.json"
+IMAGES_SHA256 = "images_sha256"  # in a scene's report: a fingerprint of each camera's registered images
 REPORT_PAGE = "report.html"  # the same for people
 MAP_FILE = "map.json"
 COPC_FILE = "points.copc.laz"

@@ -60,6 +60,9 @@ class ExportSource:
         Number of images whose mask a network made while the scene was reconstructed; such masks are not kept.
     components_elsewhere
         Folders of the parts of the drive that nothing links to this scene: they are scenes of their own.
+    images_sha256
+        A fingerprint of each camera's registered images, by its name, as `fingerprints_of_images` makes them; empty of
+        maps, and of scenes of versions that did not record them.
     """
 
     scene: Scene
@@ -71,6 +74,7 @@ class ExportSource:
     folder: Path = Path()
     masks_of_network: int = 0
     components_elsewhere: Sequence[str] = ()
+    images_sha256: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def registered(self) -> list[int]:

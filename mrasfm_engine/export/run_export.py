@@ -20,7 +20,9 @@ from mrasfm_engine.export.formats import WRITERS
 from mrasfm_engine.export.publishing import publishing, while_nothing_moves
 from mrasfm_engine.export.scene import write_json
 from mrasfm_engine.export.stored_scene import read_source
+from mrasfm_engine.io.stage_store import fingerprints_of_images, sha256_of_files
 from mrasfm_engine.preflight.drive_reader import read_drive
+from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import Cancel, StageProgress
 from schemas import LabelMap
 from schemas.artifacts import REPORT_FILE, ROAD_TIFF_FILE, drive_of_scene
@@ -69,6 +71,9 @@ def run_export(request: ExportRequest, *, progress: StageProgress, cancel: Cance
     _check_needs(request, source)
     if any(EXPORT_FORMATS[name].needs_images for name in request.formats):
         source = replace(source, files=_drive_files(request, source))
+    else:
+        for folder in request.drives.values():  # no format needs them, and a slip in their names would go unseen
+            read_drive(folder)
     results: dict[str, Any] = {}
     replaced = partial(_replaced, request)
     with publishing(request.out, _size_bytes(request, source), replaced=replaced) as work:
@@ -279,6 +284,7 @@ def _drive_files(request: ExportRequest, source: ExportSource) -> DriveFiles:
                 remedy=f"Give the drive that scene {scene} was made of." if scene else "Give the scene's own drive.",
                 code="other-drive",
             )
+        _require_same_images(request, source, drive)
         folders[scene], labels[scene] = drive.root, drive.manifest.label_map
     unused = sorted(set(request.drives) - listed.keys() - {drive_of_scene(scene) for scene in listed})
     if unused:
@@ -288,6 +294,29 @@ def _drive_files(request: ExportRequest, source: ExportSource) -> DriveFiles:
             code="unknown-scene",
         )
     return DriveFiles(folders=folders, label_maps=labels)
+
+
+def _require_same_images(request: ExportRequest, source: ExportSource, drive: Drive) -> None:
+    """Refuse images that the scene was not made of: drives that begin at time 0 may agree in names and times."""
+    if not source.images_sha256:
+        return
+    files = [source.scene.drive.images[image].file for image in source.registered]
+    try:
+        contents = sha256_of_files(drive.root, files, threads=request.threads)
+    except OSError as error:
+        raise InputError(
+            f"image {error.filename} of drive {drive.root} cannot be read: {error.strerror}",
+            remedy="Give the scene's own drive, with all its images.",
+            code="missing-file",
+        ) from None
+    found = fingerprints_of_images(source.scene, contents)
+    for camera, expected in source.images_sha256.items():
+        if found.get(camera) != expected:
+            raise InputError(
+                f"drive {drive.root} has other images of camera {camera} than those that the scene was made of",
+                remedy="Give the scene's own drive, with its images as they were.",
+                code="other-drive",
+            )
 
 
 def _named_files(source: ExportSource) -> dict[str, dict[str, int]]:

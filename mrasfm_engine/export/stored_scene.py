@@ -26,7 +26,7 @@ from mrasfm_engine.scene.drive import Drive, DriveImage, matrix_from_pose
 from mrasfm_engine.scene.scene import CameraCalibration, Georeference, ImageFeatures, Scene
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas import DriveManifest, Frame, FrameImage, Pose, Rig
-from schemas.artifacts import MAP_FILE, OWN_CAR_FOLDER, REPORT_FILE, SCENES_FOLDER
+from schemas.artifacts import IMAGES_SHA256, MAP_FILE, OWN_CAR_FOLDER, REPORT_FILE, SCENES_FOLDER
 
 VERSION = 1  # of the documents
 REMEDY = "Give a folder that `mrasfm reconstruct --out` or `mrasfm aggregate --out` wrote, with all its files."
@@ -79,6 +79,7 @@ def _scene(folder: Path) -> ExportSource:
         own_cars=dict(_own_cars(folder, drive)),
         masks_of_network=_masks_of_network(report),
         components_elsewhere=[part["folder"] for part in report.get("components", []) if part["folder"] != "."],
+        images_sha256=dict(report.get(IMAGES_SHA256, {})),
     )
 
 

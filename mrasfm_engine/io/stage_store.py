@@ -14,7 +14,7 @@ import os
 import secrets
 import weakref
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.errors import storage_error
 from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import checkpoint_file
 
 Arrays = dict[str, NDArray[Any]]
@@ -40,9 +41,28 @@ def fingerprint(*parts: object) -> str:
 
 def content_sha256_of(drive: Drive, *, threads: int) -> dict[str, str]:
     """Read all images and masks of a drive: their SHA-256 by their names in the manifest."""
-    names = _files(drive)
+    return sha256_of_files(drive.root, _files(drive), threads=threads)
+
+
+def sha256_of_files(folder: Path, names: Sequence[str], *, threads: int) -> dict[str, str]:
+    """Read files of a folder: their SHA-256 by their names."""
     with ThreadPoolExecutor(threads) as pool:
-        return dict(zip(names, pool.map(lambda name: _content_sha256(drive.root / name), names), strict=True))
+        return dict(zip(names, pool.map(lambda name: _content_sha256(folder / name), names), strict=True))
+
+
+def fingerprints_of_images(scene: Scene, content_sha256: Mapping[str, str]) -> dict[str, str]:
+    """Hash the names and contents of the registered images of each camera, by its name.
+
+    Parameters
+    ----------
+    content_sha256
+        SHA-256 of the files of all registered images by their names in the manifest.
+    """
+    files: dict[str, list[str]] = {}
+    for i in np.flatnonzero(scene.image_registered):
+        image = scene.drive.images[i]
+        files.setdefault(scene.drive.cameras[image.camera].name, []).append(image.file)
+    return {camera: fingerprint([(file, content_sha256[file]) for file in of]) for camera, of in files.items()}
 
 
 def drive_fingerprint(drive: Drive, content_sha256: Mapping[str, str]) -> str:

@@ -14,7 +14,7 @@ from mrasfm_engine.stages._matches import matches, pack_pairs, unpack_pairs
 from mrasfm_engine.stages._own_car import own_cars
 from mrasfm_engine.stages._refinement import refinement
 from mrasfm_engine.stages._run import VERSIONS, Run, store_of
-from mrasfm_engine.stages._scene import numbered_components, pictures
+from mrasfm_engine.stages._scene import numbered_components, pictures, record_images
 from mrasfm_engine.stages._standing import all_units, in_units, leave_out_standing
 from mrasfm_engine.stages._submap_run import SubmapRun
 from mrasfm_engine.stages._submaps import mapped
@@ -43,6 +43,7 @@ __all__ = [
     "preflight",
     "prior",
     "probe",
+    "record_images",
     "refinement",
     "store_features",
     "store_of",

@@ -12,13 +12,14 @@ import numpy as np
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.freed_memory import return_freed_memory
+from mrasfm_engine.io.stage_store import fingerprints_of_images
 from mrasfm_engine.mapping.components import LinkedBy
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.unit_components import connected_units
 from mrasfm_engine.stages._refinement import RefinedComponent
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.visualization.pictures import draw_pictures
-from schemas.artifacts import Stage
+from schemas.artifacts import IMAGES_SHA256, Stage
 
 
 def numbered_components(
@@ -37,6 +38,12 @@ def numbered_components(
         for other, report in others
     ]
     return whole, numbered
+
+
+def record_images(run: Run, whole: Scene, others: Sequence[RefinedComponent]) -> None:
+    """Put what the scenes' images are into their reports, so that an export can tell the drive from another one."""
+    for scene, report in [(whole, run.report), *others]:
+        report[IMAGES_SHA256] = fingerprints_of_images(scene, run.contents)
 
 
 def pictures(run: Run, result: Scene, scratch: Path) -> PictureFiles:

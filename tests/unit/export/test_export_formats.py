@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -25,6 +26,7 @@ from mrasfm_engine.export.publishing import publishing
 from mrasfm_engine.export.run_export import ExportRequest, run_export
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.export.stored_scene import read_source
+from mrasfm_engine.io.stage_store import fingerprints_of_images, sha256_of_files
 from mrasfm_engine.preflight.drive_reader import write_manifest
 from schemas.exports import EXPORT_FORMATS
 from tests.helpers.export_example import MISSING_UNIT, UNITS, make_scene
@@ -371,6 +373,34 @@ def test_another_drive_with_the_same_names_is_refused(tmp_path: Path) -> None:
     ) as found:
         run_export(request, progress=_nothing, cancel=_never)
     assert found.value.code == "other-drive"
+
+
+def test_a_drive_with_the_same_names_and_times_is_refused_by_its_images(tmp_path: Path) -> None:
+    """Of drives whose clocks begin at 0, as KITTI's do, only the images differ."""
+    scene = written(tmp_path, USUAL)
+    drive = tmp_path / "drive"
+    files = [scene.drive.images[i].file for i in np.flatnonzero(scene.image_registered)]
+    fingerprints = fingerprints_of_images(scene, sha256_of_files(drive, files, threads=1))
+    write_scene(scene, tmp_path / "scene", {"images_sha256": fingerprints})
+    request = ExportRequest(folder=tmp_path / "scene", out=tmp_path / "out", formats=["mcap"], drives={"": drive})
+    run_export(request, progress=_nothing, cancel=_never)
+    assert cv2.imwrite(str(drive / files[-1]), np.zeros((600, 960, 3), np.uint8))
+    camera = scene.drive.cameras[scene.drive.images[np.flatnonzero(scene.image_registered)[-1]].camera].name
+    with pytest.raises(InputError, match=rf"has other images of camera {camera} than") as found:
+        run_export(request, progress=_nothing, cancel=_never)
+    assert found.value.code == "other-drive"
+    (drive / files[-1]).unlink()
+    with pytest.raises(InputError, match=r"cannot be read: No such file"):
+        run_export(request, progress=_nothing, cancel=_never)
+
+
+def test_a_drive_that_no_format_needs_is_looked_for(tmp_path: Path) -> None:
+    write_scene(make_scene(), tmp_path / "scene", {})
+    drives = {"": tmp_path / "nowhere"}
+    request = ExportRequest(folder=tmp_path / "scene", out=tmp_path / "out", formats=["kitti"], drives=drives)
+    with pytest.raises(InputError, match="nowhere does not exist"):
+        run_export(request, progress=_nothing, cancel=_never)
+    assert not (tmp_path / "out").exists()
 
 
 def test_components_that_are_scenes_of_their_own_are_said(tmp_path: Path) -> None:
