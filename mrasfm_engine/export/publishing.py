@@ -16,6 +16,7 @@ from pathlib import Path
 
 from mrasfm_engine.errors import InputError, StorageError, storage_error
 from schemas.artifacts import CHECKPOINT_FOLDER, REPORT_FILE
+from schemas.file_names import MANIFEST_NAME
 
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
@@ -65,9 +66,9 @@ def publishing(
 
 
 def require_free(out: Path, names: Sequence[str], *, result: str) -> None:
-    """Refuse a folder in which files that no result has made would be replaced.
+    """Refuse a file, a drive, and a folder in which files that no result has made would be replaced.
 
-    A folder with a result, or with finished stages of a run that was interrupted, is that result's.
+    Any other folder with a result, or with finished stages of a run that was interrupted, is that result's.
 
     Parameters
     ----------
@@ -81,13 +82,23 @@ def require_free(out: Path, names: Sequence[str], *, result: str) -> None:
     InputError
         That names one of them.
     """
+    remedy = f"Give the {result} a new or empty folder with --out."
+    there = next((path for path in (out, *out.parents) if os.path.lexists(path)), out)
+    if os.path.lexists(there) and not there.is_dir():
+        raise InputError(f"{there} is a file, and no folder for a {result}", remedy=remedy, code="bad-out-folder")
+    if (out / MANIFEST_NAME).is_file():
+        raise InputError(
+            f"{out} is the folder of a drive, whose files a {result} would lie among",
+            remedy=remedy,
+            code="bad-out-folder",
+        )
     if (out / COMPLETE_MARK).exists() or (out / CHECKPOINT_FOLDER).is_dir():
         return
     taken = [name for name in names if os.path.lexists(out / name)]
     if taken:
         raise InputError(
             f"{out / taken[0]} was made by no {result}, and a {result} would replace it",
-            remedy=f"Give the {result} a new or empty folder with --out.",
+            remedy=remedy,
             code="bad-out-folder",
         )
 

@@ -7,7 +7,7 @@ development kit. The rig frame is the dataset's ego frame: x forward, y left, z 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -165,10 +165,15 @@ def read(folder: Path, scene: str | None = None, *, sweeps: bool = False) -> Rec
         name=f"nuscenes-{chosen.name}",
         cameras=cameras,
         units=units,
-        notes=[*([FLAT_NOTE] if all(abs(pose.translation[2]) < FLAT_M for pose in ego.values()) else []), SHUTTER_NOTE],
+        notes=[*([FLAT_NOTE] if _is_flat(ego) else []), SHUTTER_NOTE],
         vehicle=_name(log.vehicle if log else None),
         common_world=None if city is None else f"nuscenes-{city}",
     )
+
+
+def _is_flat(ego: Mapping[str, _Posed]) -> bool:
+    """Return whether there are ego poses, and all of them are in a plane."""
+    return bool(ego) and all(abs(pose.translation[2]) < FLAT_M for pose in ego.values())
 
 
 def _log(scene: _Scene, tables: Path) -> _Log | None:

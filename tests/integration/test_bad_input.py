@@ -159,7 +159,7 @@ def test_calibration_given_as_its_inverse(variant: Variant, mrasfm: Run) -> None
 
 def test_one_camera_without_a_scale(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=["front"])
-    assert "nothing gives it a scale" in refused(variant.save(), mrasfm, "--no-gnss")
+    assert "nothing gives the drive a scale" in refused(variant.save(), mrasfm, "--no-gnss")
 
 
 def test_nothing_matches(variant: Variant, mrasfm: Run) -> None:
@@ -191,7 +191,7 @@ def test_oddities_are_warned_of_and_used(variant: Variant, mrasfm: Run) -> None:
     assert result.code == 0
     assert "units registered: 4 of 4" in result.out
     for words in (
-        "warning: 1 images have 16 bits a channel and are read with 8: images/front/deep.png",
+        "warning: 1 images have 16 bits a channel and are read with the upper 8 of them: images/front/deep.png",
         "warning: 1 images have an alpha channel, which is ignored: images/front/clear.png",
         "warning: 2 images in the drive's folders are not in drive.json and are ignored: images/front/000001.jpg",
     ):
@@ -211,4 +211,4 @@ def test_one_camera_with_gnss(variant: Variant, mrasfm: Run) -> None:
     variant.keep(cameras=["front"])
     result = mrasfm("reconstruct", variant.save().root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 0
-    assert "its scale comes from GNSS alone" in result.out
+    assert "the drive's scale comes from GNSS alone" in result.out

@@ -615,6 +615,28 @@ def test_every_point_names_its_component(scene: Scene, tmp_path: Path) -> None:
     assert [row.agrees for row in comparisons.ply(split, rows) if row.what == "a component"] == [False]
 
 
+@pytest.mark.parametrize("inside", [".", "scene", "some/scene"])
+def test_a_file_is_no_folder_for_a_scene(tmp_path: Path, inside: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match=r"/file is a file, and no folder for a scene") as found:
+        reconstruct(tmp_path / "no drive", tmp_path / "file" / inside, EngineConfig())
+    assert found.value.code == "bad-out-folder"
+    (tmp_path / "nowhere").symlink_to(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"/nowhere is a file"):
+        reconstruct(tmp_path / "no drive", tmp_path / "nowhere" / inside, EngineConfig())
+
+
+def test_the_folder_of_a_drive_is_no_folder_for_a_scene(tmp_path: Path) -> None:
+    """Also where a scene lies in it already: what belongs to which would be lost."""
+    (tmp_path / "drive.json").touch()
+    for _ in range(2):
+        with pytest.raises(InputError, match=r"is the folder of a drive, whose files a scene would lie among") as found:
+            reconstruct(tmp_path, tmp_path, EngineConfig())
+        assert found.value.code == "bad-out-folder"
+        (tmp_path / "report.json").touch()
+    require_free_folder(tmp_path / "scene")
+
+
 def test_a_folder_with_files_that_no_scene_has_made_is_refused(scene: Scene, tmp_path: Path) -> None:
     """Somebody's own pictures, say, would be replaced; other files are kept beside a scene."""
     (tmp_path / "notes.txt").touch()

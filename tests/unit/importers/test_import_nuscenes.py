@@ -215,6 +215,13 @@ def test_without_laser_scanner_the_cameras_mean_counts(dataset: Path, tmp_path: 
     assert abs(truth[0, 1] - east_m(mean_us)) < 1e-5
 
 
+def test_tables_without_ego_poses_have_no_truth(dataset: Path, tmp_path: Path) -> None:
+    write_tables(dataset, make_tables() | {"ego_pose": []})
+    summary = import_recording(dataset, tmp_path / "drive", scene="scene-0061")
+    assert not summary.truth
+    assert not any("truth" in note for note in summary.notes)
+
+
 def test_frames_and_the_only_scene(dataset: Path, tmp_path: Path) -> None:
     tables = make_tables()
     tables["scene"] = tables["scene"][:1]
