@@ -132,19 +132,27 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
 
 
 def _require_near(name: str, system: CRS, at: tuple[float, float]) -> None:
-    """Refuse places where a projection gives numbers that mean nothing. The next zone is often used on purpose."""
-    area = system.area_of_use
-    if area is None:
-        return
-    south, north = area.south - _NEAR_DEG, area.north + _NEAR_DEG
-    east_of_west = (at[1] - area.west + _NEAR_DEG) % 360.0
-    width = (area.east - area.west) % 360.0 or 360.0
-    if not south <= at[0] <= north or east_of_west > width + 2.0 * _NEAR_DEG:
+    if not is_near(system, at):
+        assert system.area_of_use is not None, "one without an area is near everywhere"
         raise InputError(
-            f"{name} is for {area.name}, and the scene lies at {at[0]:.3f}, {at[1]:.3f}",
+            f"{name} is for {system.area_of_use.name}, and the scene lies at {at[0]:.3f}, {at[1]:.3f}",
             remedy="Give a system whose area the scene lies in.",
             code="outside-crs",
         )
+
+
+def is_near(system: CRS, at: tuple[float, float]) -> bool:
+    """Return whether a place, latitude and longitude, is in a system's area or not far from it, if it has one.
+
+    Elsewhere a projection gives numbers that mean nothing. The next zone is often used on purpose.
+    """
+    area = system.area_of_use
+    if area is None:
+        return True
+    south, north = area.south - _NEAR_DEG, area.north + _NEAR_DEG
+    east_of_west = (at[1] - area.west + _NEAR_DEG) % 360.0
+    width = (area.east - area.west) % 360.0 or 360.0
+    return south <= at[0] <= north and east_of_west <= width + 2.0 * _NEAR_DEG
 
 
 def _known(name: str, code: str) -> CRS:

@@ -10,6 +10,7 @@ import datetime
 import math
 import re
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import utm
-from mrasfm_engine.geometry.earth_system import best_transformer
+from mrasfm_engine.geometry.earth_system import best_transformer, is_near
 from mrasfm_engine.importers.tables import read_lines
 
 EXIF, GPS = 0x8769, 0x8825
@@ -119,6 +120,7 @@ def read_geo_txt(path: Path) -> dict[str, GeoTag]:
     """
     lines = read_lines(path, what="image positions")
     rows: dict[str, list[float]] = {}
+    numbers: list[int] = []  # of the rows' lines
     for number, line in enumerate(lines[1:], start=2):
         words = line.split()
         if not words:
@@ -129,9 +131,10 @@ def read_geo_txt(path: Path) -> dict[str, GeoTag]:
                 f"image positions {path}, line {number}: {words[0]} has two lines", remedy="Keep one.", code="bad-table"
             )
         rows[words[0]] = values
+        numbers.append(number)
     if not rows:
         raise InputError(f"image positions {path} has no rows", remedy="Remove the file, or fill it.", code="bad-table")
-    places = _geodetic(lines[0].strip(), np.array([values[:2] for values in rows.values()]), path)
+    places = _geodetic(lines[0].strip(), np.array([values[:2] for values in rows.values()]), path, numbers)
     return {
         name: GeoTag(
             latitude_deg=float(latitude),
@@ -180,34 +183,73 @@ def _numbers(words: list[str], where: str) -> list[float]:
     return values
 
 
-def _geodetic(system: str, points: Any, path: Path) -> Any:
-    """Longitudes and latitudes (n, 2) on WGS84 of coordinates x, y in a system."""
-    import pyproj
+def _geodetic(system: str, points: Any, path: Path, numbers: Sequence[int]) -> Any:
+    """Longitudes and latitudes (n, 2) on WGS84 of coordinates x, y (n, 2) in a system, on lines of these numbers."""
     from pyproj.exceptions import CRSError, ProjError
 
-    remedy = "Give EPSG:4326, another EPSG code, a PROJ string or WGS84 UTM 32N in the first line."
-    if (match := _UTM.fullmatch(system)) and 1 <= int(match[1]) <= utm.ZONES:
-        system = f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
+    where = f"image positions {path}, line"
     try:
-        crs = pyproj.CRS.from_user_input(system)
-        if crs.is_compound or crs.is_vertical:
-            raise InputError(
-                f"image positions {path}, line 1: {system[:80]!r} has heights of its own, and those of the lines are "
-                "taken as metres above the ellipsoid",
-                remedy="Give the horizontal system alone, and ellipsoidal heights in metres.",
-                code="bad-table",
-            )
-        to_wgs84 = _transformer(crs.to_2d(), points, system)
+        crs = _horizontal_system(system, f"{where} 1")
+        known = _with_area(crs)
+        _require_no_degrees(known, points, f"{where} {numbers[0]}")
+        to_wgs84 = _transformer(crs, points, system)
         found = np.stack(to_wgs84.transform(points[:, 0], points[:, 1], errcheck=True), -1)
     except (CRSError, ProjError) as error:
         said = " ".join(str(error).split())[:150]
+        remedy = "Give EPSG:4326, another EPSG code, a PROJ string or WGS84 UTM 32N in the first line."
+        raise InputError(f"{where} 1: {system[:80]!r}: {said}", remedy=remedy, code="bad-table") from None
+    for number, (longitude, latitude) in zip(numbers, found.tolist(), strict=True):
+        if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0):  # also refuses NaN
+            raise InputError(
+                f"{where} {number}: coordinates are outside of {system[:80]!r}: are x and y swapped?",
+                remedy="Give x (east, longitude) before y.",
+                code="bad-table",
+            )
+        if not is_near(known, (latitude, longitude)):
+            at = f"{latitude:.3f}, {longitude:.3f}"
+            raise InputError(
+                f"{where} {number}: lies at {at}, far outside of the area of {system[:80]!r}",
+                remedy="Give in the first line the system that the coordinates are in, and x (east) before y.",
+                code="outside-crs",
+            )
+    return found
+
+
+def _horizontal_system(system: str, where: str) -> Any:
+    """The system that the first line names."""
+    import pyproj
+
+    if (match := _UTM.fullmatch(system)) and 1 <= int(match[1]) <= utm.ZONES:
+        system = f"EPSG:{(32600 if match[2].upper() == 'N' else 32700) + int(match[1])}"
+    crs = pyproj.CRS.from_user_input(system)
+    if crs.is_compound or crs.is_vertical:
         raise InputError(
-            f"image positions {path}, line 1: {system[:80]!r}: {said}", remedy=remedy, code="bad-table"
-        ) from None
-    if not np.isfinite(found).all() or np.abs(found[:, 1]).max() > 90 or np.abs(found[:, 0]).max() > 180:
-        raise InputError(
-            f"image positions {path}: coordinates are outside of {system[:80]!r}: are x and y swapped?",
-            remedy="Give x (east, longitude) before y.",
+            f"{where}: {system[:80]!r} has heights of its own, and those of the lines are taken as metres above the "
+            "ellipsoid",
+            remedy="Give the horizontal system alone, and ellipsoidal heights in metres.",
             code="bad-table",
         )
-    return found
+    return crs.to_2d()
+
+
+def _with_area(crs: Any) -> Any:
+    """The system, or for one without an area, as a PROJ string's, the one of EPSG that is most like it, if any is."""
+    import pyproj
+
+    code = crs.to_epsg() if crs.area_of_use is None else None
+    return crs if code is None else pyproj.CRS.from_epsg(code)
+
+
+def _require_no_degrees(crs: Any, points: Any, where: str) -> None:
+    """Refuse metres that are degrees: all of them within 180 m of the system's origin, where hardly a road is.
+
+    The place may be near the system's area, as that of UTM's origin is, or in it. A system of the user's own, which has
+    no area, may have its origin on the road.
+    """
+    if crs.is_projected and crs.area_of_use is not None and (np.abs(points) <= (180.0, 90.0)).all():
+        raise InputError(
+            f"{where}: {points[0, 0]:g}, {points[0, 1]:g} and all others look like degrees, and the first line names a "
+            "system of metres",
+            remedy="Give EPSG:4326 in the first line for longitude and latitude, or coordinates of the named system.",
+            code="outside-crs",
+        )

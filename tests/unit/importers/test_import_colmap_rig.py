@@ -207,7 +207,12 @@ def test_one_of_several_rigs(rig: Path, tmp_path: Path) -> None:
         ("EPSG:4326\na.jpg 8.4\n", "line 2: has no two coordinates"),
         ("EPSG:4326\na.jpg nan 49\n", "line 2: has no two coordinates"),
         ("EPSG:4326\na.jpg 8 49\na.jpg 8 49\n", "line 3: a.jpg has two lines"),
-        ("EPSG:4326\na.jpg 49.0 98.4 1\n", "are x and y swapped"),
+        ("EPSG:4326\na.jpg 49.0 98.4 1\n", "line 2: coordinates are outside of 'EPSG:4326': are x and y swapped"),
+        ("EPSG:32632\na.jpg 8.4 49 1\nb.jpg 8.5 49 1\n", "line 2: 8.4, 49 and all others look like degrees"),
+        ("WGS84 UTM 32N\n\na.jpg 8.4 49\n", "line 3: 8.4, 49 and all others look like degrees"),
+        ("+proj=utm +zone=32 +datum=WGS84\na.jpg 8.4 49\n", "look like degrees"),
+        ("EPSG:3857\na.jpg 8.4 49\n", "look like degrees"),
+        ("EPSG:32632\na.jpg 456000 5428000\nb.jpg 5428000 456000\n", "line 3: lies at .*, far outside of the area of"),
         ("Gauss\na.jpg 8 49\n", "line 1: 'Gauss'"),
     ],
 )
@@ -231,6 +236,18 @@ def test_systems_that_would_be_metres_off_are_refused(tmp_path: Path, system: st
     (tmp_path / "geo.txt").write_text(f"{system}\na.jpg 530000 180000 40\n")
     with pytest.raises(InputError, match=message):
         read_geo_txt(tmp_path / "geo.txt")
+
+
+@pytest.mark.parametrize(
+    ("system", "x", "y", "longitude"),
+    [
+        ("EPSG:32632", 900_000.0, 5_430_000.0, 14.46),  # the next zone, on purpose
+        ("+proj=tmerc +lat_0=49 +lon_0=8.4 +datum=WGS84", 20.0, 30.0, 8.400273),  # a site's own system
+    ],
+)
+def test_systems_around_their_area_are_taken(tmp_path: Path, system: str, x: float, y: float, longitude: float) -> None:
+    (tmp_path / "geo.txt").write_text(f"{system}\na.jpg {x} {y}\n")
+    assert read_geo_txt(tmp_path / "geo.txt")["a.jpg"].longitude_deg == pytest.approx(longitude, abs=0.01)
 
 
 def test_a_prefix_that_another_one_begins_with(rig: Path, tmp_path: Path) -> None:
