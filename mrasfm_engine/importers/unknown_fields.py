@@ -35,6 +35,8 @@ def notes_of_unknown_fields(what: str, unknown: Iterable[str], *, known: Collect
 
 def _with_match(name: str, known: Collection[str]) -> str:
     shown = name if len(name) <= MAX_CHARACTERS else name[:MAX_CHARACTERS] + "..."
+    if name.lower() in _DISTORTION:
+        return shown  # no single field stands for it
     near = get_close_matches(name[:MAX_CHARACTERS].lower(), {field.lower() for field in known}, 1)
     match = next((field for field in known if near and field.lower() == near[0]), None)
     return shown if match is None else f"{shown} (is it {match}?)"

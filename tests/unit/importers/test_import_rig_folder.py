@@ -322,14 +322,14 @@ def test_unknown_fields_are_noted(recording: Path, tmp_path: Path) -> None:
     def add(document: dict[str, Any]) -> None:
         document["body_axis"] = "flu"
         for camera in document["cameras"].values():
-            camera.update(D=[-0.3, 0.1, 0, 0], sigma_rot=0.1, comment="no field")
+            camera.update(D=[-0.3], distortion=[-0.3], sigma_rot=0.1, comment="no field")
 
     edit_rig(recording, add)
     (recording / "gnss_antenna.json").write_text('{"antenna_in_body_m": [0.3, -1.5, 0.1], "units": "cm"}')
     notes = import_recording(recording, tmp_path / "drive").notes
     assert notes == [
         "rig.json: not known, and not read: body_axis (is it body_axes?).",
-        "rig.json: cameras: not known, and not read: D, sigma_rot (is it sigma_rotation_deg?). "
+        "rig.json: cameras: not known, and not read: D, distortion, sigma_rot (is it sigma_rotation_deg?). "
         "Distortion is read from 'model' and 'params' alone.",
         "gnss_antenna.json: not known, and not read: units.",
     ]
