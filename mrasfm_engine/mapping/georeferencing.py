@@ -138,15 +138,15 @@ def align_with_gnss(
     rotation, weight = similarity[:3, :3] / scale, 1.0 / (sigma_m[inlier] ** 2).mean(1)
     centre = np.average(antenna_m[inlier], axis=0, weights=weight)
     spread = float(((antenna_m[inlier] - centre) ** 2 / (factor * sigma_m[inlier]) ** 2).sum())
-    sigma_scale = 1.0 / np.sqrt(max(spread, 1e-12)) / scale
-    if not scale_range[0] - 3 * sigma_scale <= scale <= scale_range[1] + 3 * sigma_scale:
+    sigma = 1.0 / np.sqrt(max(spread, 1e-12))  # of the scale: of a short one a large part
+    if not scale_range[0] - 3 * sigma <= scale <= scale_range[1] + 3 * sigma:
         return _scale_is_off(scale)
     return GnssAlignment(
         world_from_model=se3.transform(rotation, _apply(similarity, centre[None])[0] - rotation @ centre),
         inlier=inlier,
         residual_m=np.linalg.norm(off_m, axis=1),
         scale=scale,
-        sigma_scale=float(sigma_scale),
+        sigma_scale=float(sigma / scale),
         noise_factor=factor,
     )
 

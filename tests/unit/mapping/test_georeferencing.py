@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -100,6 +100,16 @@ def test_a_rig_that_is_off_in_scale_is_aligned_all_the_same(sigma_m: float, trav
     assert isinstance(found, GnssAlignment)
     assert found.scale == pytest.approx(scale, abs=0.002)
     assert found.inlier.mean() > 0.9
+
+
+@pytest.mark.parametrize(("factor", "units"), [(0.02, 14), (0.1, 14), (0.02, 60)])
+def test_positions_of_another_size_are_refused_however_noisy(factor: float, units: int) -> None:
+    """Positions in radians instead of degrees lie together: their size is hardly known, and not the trajectory's."""
+    t = track(units=units, spacing_m=1.2, sigma_m=1.0)
+    small = t.measured_m.mean(axis=0) + factor * (t.measured_m - t.measured_m.mean(axis=0))
+    found = replace(t, measured_m=small).align()
+    assert isinstance(found, Refusal)
+    assert found.is_of_scale
 
 
 @pytest.mark.parametrize("seed", range(3))
