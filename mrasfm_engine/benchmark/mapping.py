@@ -183,10 +183,13 @@ def _run(progress: StageProgress, drive_folder: Path, config: EngineConfig, stor
 
 
 def simulated_run(progress: StageProgress, drive: Drive, config: EngineConfig, store: StageStore) -> stages.Run:
-    """A run of a drive without images, which has no own car."""
-    key = fingerprint(drive.manifest.name)  # there are no files whose fingerprint it could be
+    """A run of a drive whose images have no files: there is no own car, and none is like another."""
+    contents = {image.file: fingerprint(drive.manifest.name, image.file) for image in drive.images}
     own_cars: list[Bools | None] = [None for _ in drive.cameras]
-    return stages.Run(drive, config, store, progress, lambda: False, own_cars=own_cars, key=key)
+    key = fingerprint(drive.manifest.name)
+    return stages.Run(
+        drive, config, store, progress, lambda: False, content_sha256=contents, own_cars=own_cars, key=key
+    )
 
 
 def _map(

@@ -7,12 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mrasfm_engine.benchmark.mapping import simulated_run
 from mrasfm_engine.benchmark.scaling import measure_growth
 from mrasfm_engine.benchmark.side_by_side import Settings
 from mrasfm_engine.benchmark.simulated_descriptors import SimulatedImages
+from mrasfm_engine.benchmark.simulated_drive import drive_of_route
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.io.stage_store import StageStore
+from mrasfm_engine.scene.submaps import Span
+from mrasfm_engine.stages import SubmapRun
 from mrasfm_engine.synthetic.long_route import simulate_long_route
+from schemas.artifacts import Stage
 
 KEYPOINTS = 600
 
@@ -31,6 +37,14 @@ def test_an_image_has_the_same_descriptors_at_every_use_and_its_points_look_alik
     best, second = -np.sort(-cosine, axis=1)[:, :2].T
     is_distinct = (1.0 - best) < 0.8**2 * (1.0 - second)
     assert abs(int(is_distinct.sum()) - common) < 0.05 * common
+
+
+def test_sub_maps_of_a_route_need_no_files(tmp_path: Path) -> None:
+    drive = drive_of_route("stereo", simulate_long_route("stereo", 12), tmp_path)
+    run = simulated_run(lambda stage, done, total: None, drive, EngineConfig(), StageStore(tmp_path))
+    part = SubmapRun(run, Span(number=1, first=0, last=6)).run
+    assert part.repeated == run.repeated == frozenset()
+    assert part.next_key(Stage.FEATURES, None) != run.next_key(Stage.FEATURES, None)
 
 
 @pytest.mark.slow
