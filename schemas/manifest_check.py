@@ -131,7 +131,23 @@ def _check_frames(recorded: _Recorded) -> list[Finding]:
         findings.append(
             warning("camera-without-images", f"no images of camera {listed(unused)}", "Take it out of the rig.")
         )
-    return findings
+    return [*findings, *_check_common_frames(recorded)]
+
+
+def _check_common_frames(recorded: _Recorded) -> list[Finding]:
+    """Find cameras whose frames have images of no other: only the motion between frames relates them to the rig."""
+    together = {camera for frame in recorded.manifest.frames if len(frame.images) > 1 for camera in frame.images}
+    alone = [c.name for c in recorded.manifest.rig.cameras if c.name in recorded.used_cameras - together]
+    if not alone or len(recorded.used_cameras) < 2:
+        return []
+    return [
+        warning(
+            "camera-alone",
+            f"no frame with an image of {listed(alone)} has one of another camera",
+            "Put images that were taken together into one frame, by the time that is nearest. Are all cameras on one "
+            "clock?",
+        )
+    ]
 
 
 def _check_times(recorded: _Recorded) -> list[Finding]:

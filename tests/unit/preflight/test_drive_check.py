@@ -226,6 +226,15 @@ def test_frame_and_camera_without_images(drive_document: Document, write_drive: 
     assert "camera right" in found["camera-without-images"][0].what
 
 
+def test_a_camera_that_is_never_in_a_frame_with_another(drive_document: Document, write_drive: WriteDrive) -> None:
+    for number, frame in enumerate(drive_document["frames"]):
+        del frame["images"]["left" if number % 2 else "right"]
+    assert "left, right" in only(write_drive(drive_document), "camera-alone", Severity.WARNING).what
+    for number, frame in enumerate(drive_document["frames"]):
+        frame["images"] = {"left": {"file": f"images/left/{number:06d}.png"}}
+    assert "camera-alone" not in findings(write_drive(drive_document))
+
+
 @pytest.mark.parametrize(("factor", "unit"), [(0.001, "milliseconds"), (1000, "nanoseconds")])
 def test_frame_times_in_other_units(
     drive_document: Document, write_drive: WriteDrive, factor: float, unit: str
