@@ -8,7 +8,7 @@ from enum import StrEnum
 
 
 class Severity(StrEnum):
-    """Severity of a finding: an error stops the reconstruction."""
+    """Severity of a finding: an error of a check stops the reconstruction, one in a report says that it went wrong."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -48,12 +48,12 @@ def as_json(finding: Finding) -> dict[str, str]:
 
 
 def error(code: str, what: str, remedy: str) -> Finding:
-    """A finding that stops the reconstruction."""
+    """A finding that stops the reconstruction, or, in its report, says what went wrong."""
     return Finding(severity=Severity.ERROR, code=code, what=what, remedy=remedy)
 
 
 def warning(code: str, what: str, remedy: str) -> Finding:
-    """A finding that does not."""
+    """A finding of what a user should know."""
     return Finding(severity=Severity.WARNING, code=code, what=what, remedy=remedy)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.scene_matching import CrossMatches
-from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
+from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points, thinned
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.rigid_groups import RigidGroups
@@ -209,6 +209,7 @@ def adjust_transform(
     sets = problem.sets
     assert sets is not None
     sigma2 = max(0.25, float(np.median(errors_px**2)) / (2 * np.log(2)) if len(errors_px) else 1.0)
+    problem = replace(problem, observations=thinned(problem.observations, problem.layout.unit_slot >= 0))
     covariance = sets.covariances(problem.normal_equations(solution, 0.0), solution)[0] * sigma2 * CORRELATION
     return RefinedSeam(
         a_from_b=se3.inverse(poses[0]) @ poses[1],

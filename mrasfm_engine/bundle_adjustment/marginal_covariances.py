@@ -28,7 +28,7 @@ class Covariances:
     sigma_unit_position_m: Floats  # (u, 3), NaN for fixed units
     sigma_camera: Floats  # (c, CAMERA_DOF) in the order of `problem`; NaN for fixed cameras, 0 for what is held
     sigma_scale: float  # relative, of the trajectory's size
-    from_fixed_m: Floats  # (u, 3) places of units from what stays where it is when the scene's size changes
+    by_scale_m: Floats  # (u, 3) by how much units move when the scene's size changes, as what is known lets them
     calibration: Floats  # (6 c, 6 c) joint covariance of the free cameras' rotations and translations, camera by camera
     calibration_of_independent_errors: Floats  # (6 c, 6 c) the same as the adjustment weighs it: without shared errors
     # (6 c,) covariance of the scale with these, as the adjustment weighs errors; NaN where it is not known
@@ -41,7 +41,7 @@ class Covariances:
         return replace(
             self,
             sigma_scale=float(np.hypot(self.sigma_scale, sigma)),
-            sigma_unit_position_m=np.hypot(self.sigma_unit_position_m, sigma * self.from_fixed_m),
+            sigma_unit_position_m=np.hypot(self.sigma_unit_position_m, sigma * self.by_scale_m),
         )
 
 
@@ -69,11 +69,13 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
     places = dof * np.arange(layout.num_cameras)
     poses = np.ix_(*[(places[:, None] + np.arange(6)).ravel()] * 2)
     times = np.ix_(*[places[: len(places) if dof > TIME else 0] + TIME] * 2)
+    by_scale = np.zeros((len(layout.unit_slot), 3))
+    by_scale[layout.unit_slot >= 0] = found.by_scale_m
     result = Covariances(
         sigma_unit_position_m=per_unit[:, 3:],
         sigma_camera=per_camera,
         sigma_scale=found.sigma_scale_of_independent_errors,
-        from_fixed_m=_from_fixed_m(problem, state),
+        by_scale_m=by_scale,
         calibration=found.cameras[poses],
         calibration_of_independent_errors=found.cameras_of_independent_errors[poses],
         scale_with_calibration=found.scale_with_cameras[poses[0].ravel()],
@@ -86,16 +88,6 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
     return replace(result.with_scale_error(np.sqrt(max(more, 0.0))), sigma_scale=found.sigma_scale)
 
 
-def _from_fixed_m(problem: Problem, state: State) -> Floats:
-    """Places (u, 3) of all units from those that are held, or, where none is, from the middle of the free ones."""
-    free = problem.layout.unit_slot >= 0
-    seen = np.zeros(len(free), dtype=np.bool_)
-    seen[problem.observations.unit] = True
-    held = seen & ~free
-    result: Floats = state.unit_position_m - state.unit_position_m[held if held.any() else free].mean(axis=0)
-    return result
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Marginals:
     units: Floats  # (free units, 6) variances
@@ -104,6 +96,7 @@ class _Marginals:
     scale_with_cameras: Floats  # (d c,) as the adjustment weighs errors
     sigma_scale: float
     sigma_scale_of_independent_errors: float
+    by_scale_m: Floats  # (free units, 3)
 
 
 def _regular_marginals(
@@ -119,7 +112,7 @@ def _regular_marginals(
     units, border = eliminated.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    joint, of_readouts = _of_functionals(problem, state, eliminated, border)[1:]
+    columns, joint, of_readouts = _of_functionals(problem, state, eliminated, border)
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
     of_independent = joint[-1, -1]
@@ -143,6 +136,7 @@ def _regular_marginals(
         scale_with_cameras=scale_with_cameras,
         sigma_scale=scale,
         sigma_scale_of_independent_errors=scale_of_independent,
+        by_scale_m=columns[:split, -1].reshape(-1, UNIT_DOF)[:, 3:] / max(of_independent, 1e-30),
     )
 
 
@@ -222,6 +216,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
             scale_with_cameras=np.full(size - split, np.nan),
             sigma_scale=np.inf,
             sigma_scale_of_independent_errors=np.inf,
+            by_scale_m=np.zeros((layout.num_units, 3)),
         )
     matrix = system.matrix
     free = np.setdiff1d(np.arange(size), layout.held())
@@ -235,11 +230,14 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
     covariance[np.diag_indices(size)] = variance
     units = variance[:split].reshape(-1, UNIT_DOF)
     scale, scale_with_cameras = float("nan"), np.full(size - split, np.nan)
+    by_scale = np.zeros((layout.num_units, 3))
     if np.isinf(units[:, 3:]).any():
         scale = np.inf
     elif len(position) >= 2:
         functional = scale_functional(position)
-        scale = _sigma_scale(float(functional @ covariance[:split, :split] @ functional))
+        of_scale = covariance[:split, :split] @ functional
+        scale = _sigma_scale(float(functional @ of_scale))
+        by_scale = of_scale.reshape(-1, UNIT_DOF)[:, 3:] / max(float(functional @ of_scale), 1e-30)
         scale_with_cameras = functional @ covariance[:split, split:]
     cameras = covariance[split:, split:]
     return _Marginals(
@@ -249,6 +247,7 @@ def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginal
         scale_with_cameras=scale_with_cameras,
         sigma_scale=scale,
         sigma_scale_of_independent_errors=scale,
+        by_scale_m=by_scale,
     )
 
 

@@ -16,10 +16,10 @@ from mrasfm_engine.bundle_adjustment.problem import Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, solve
 from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.types import Bools, Cancel, Floats
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
 GRID = (8, 5)  # columns and rows of cells of an image
-MOST_UNITS = 256  # that see one point: an adjustment takes all of their pairs
+MOST_UNITS = 256  # free ones that see one point: an adjustment takes all of their pairs
 
 
 def solve_with_chosen_points(
@@ -29,7 +29,7 @@ def solve_with_chosen_points(
 
     With `an_image` zero it is `solve` with all of them.
     """
-    problem = replace(problem, observations=thinned(problem.observations))
+    problem = replace(problem, observations=thinned(problem.observations, problem.layout.unit_slot >= 0))
     if not an_image:
         return solve(problem, cancel=cancel)
     chosen = choose_points(problem.observations, problem.layout.unit_slot >= 0, image_size_px, an_image=an_image)
@@ -39,21 +39,18 @@ def solve_with_chosen_points(
     return problem.with_points_refined(replace(solution, points_m=points_m)), report
 
 
-def thinned(observations: Observations) -> Observations:
-    """The observations with at most `MOST_UNITS` units of each point, evenly spread over all that see it.
+def thinned(observations: Observations, free_units: Bools) -> Observations:
+    """The observations with those of at most `MOST_UNITS` free units (u,) of each point, spread over all that see it.
 
     What is left out is not known to the adjustment: poses get less certain, never more. Taken for a point that is known
-    already, it would tie them to it.
+    already, it would tie them to it. All points choose in one order of the units: the pairs of units that any of them
+    couples stay few.
     """
     o = observations
-    keep = np.ones(len(o.unit), dtype=np.bool_)
-    for p in np.flatnonzero(np.diff(o.first_of_point) > MOST_UNITS).tolist():
-        rows = slice(o.first_of_point[p], o.first_of_point[p + 1])
-        units = np.unique(o.unit[rows])
-        if len(units) > MOST_UNITS:
-            spread = np.linspace(0, len(units) - 1, MOST_UNITS).round().astype(np.int64)
-            keep[rows] = np.isin(o.unit[rows], units[spread])
-    if keep.all():
+    # Of a row band whose motion follows from the trajectory, three units take part.
+    most = MOST_UNITS if o.band is None else MOST_UNITS // 3
+    keep = _spread(o.first_of_point, o.unit, free_units, _spreading_order(len(free_units)), most)
+    if keep is None:
         return o
     return Observations(
         unit=o.unit[keep],
@@ -64,6 +61,42 @@ def thinned(observations: Observations) -> Observations:
         band=None if o.band is None else o.band[keep],
         fixed=o.fixed,
     )
+
+
+def _spreading_order(count: int) -> Ints:
+    """Places (count,) of numbers in an order whose beginning is spread over all of them, however much it is.
+
+    It is that of the numbers with their bits reversed [van der Corput's sequence].
+    """
+    number, reverse = np.arange(count), np.zeros(count, dtype=np.int64)
+    for _ in range(max(count - 1, 1).bit_length()):
+        reverse = 2 * reverse + number % 2
+        number = number // 2
+    return reverse
+
+
+@njit(cache=True, nogil=True)
+def _spread(first: Any, unit: Any, free: Any, order: Any, most: int) -> Any:
+    """Mask (n,) of observations that stay, those of the first units in the order; None where all do."""
+    keep, is_whole = np.ones(len(unit), np.bool_), True
+    for p in range(len(first) - 1):
+        begin, end = first[p], first[p + 1]
+        if end - begin <= most:
+            continue
+        places = np.empty(end - begin, np.int64)
+        count = 0
+        for n in range(begin, end):
+            if free[unit[n]]:
+                places[count] = order[unit[n]]
+                count += 1
+        different = np.unique(places[:count])
+        if len(different) <= most:
+            continue
+        is_whole = False
+        last = different[most - 1]
+        for n in range(begin, end):
+            keep[n] = not free[unit[n]] or order[unit[n]] <= last
+    return None if is_whole else keep
 
 
 def choose_points(observations: Observations, free_units: Bools, image_size_px: Floats, *, an_image: int) -> Bools:

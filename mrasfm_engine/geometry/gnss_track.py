@@ -44,7 +44,7 @@ class GnssTrack:
         """Positions and sigmas (m, 3) at other times, between good samples; NaN outside and in larger gaps.
 
         Between two samples they follow the antenna's way, where it is known: they are off it by as much as the samples
-        are. Elsewhere they are linear, and a bend that neighbouring samples show makes them less certain.
+        are. Elsewhere they are linear. Where either is a chord, a bend that its neighbours show makes them uncertain.
 
         Parameters
         ----------
@@ -65,42 +65,62 @@ class GnssTrack:
         inside = (fraction >= 0) & (fraction <= 1) & ((gap <= max_gap_us) | (fraction == 0) | (fraction == 1))
         share = fraction[:, None]
         blend = p[after - 1] + share * (p[after] - p[after - 1])
-        bend_m = 4.0 * fraction * (1.0 - fraction) * _bends_m(t / 1e6, p)[after - 1]
+        bend_m = _bend_on_chord_m(fraction, _bends_m(t / 1e6, p, s)[after - 1])
         if way_m is not None:
-            before_m, after_m = (_place_at(t[k], timestamps_us, way_m, gap) for k in (after - 1, after))
+            (before_m, bend_before_m), (after_m, bend_after_m) = (
+                _place_at(t[k], timestamps_us, way_m, gap) for k in (after - 1, after)
+            )
             follows_m = way_m - before_m - share * (after_m - before_m)
             known = np.isfinite(follows_m[:, 0])
             blend[known] += follows_m[known]
-            bend_m[known] = 0.0
+            bend_m[known] = (bend_before_m + fraction * (bend_after_m - bend_before_m))[known]
         position[inside] = blend[inside]
         sigma[inside] = np.hypot(np.maximum(s[after - 1], s[after]), bend_m[:, None])[inside]
         return position, sigma
 
 
-def _bends_m(time_s: Floats, position_m: Floats) -> Floats:
-    """Distance (n - 1,) of the middle of every chord between samples from a way that bends as its neighbours show."""
-    step_s, bend_mps2 = np.diff(time_s), np.zeros(len(time_s))
-    velocity = np.diff(position_m, axis=0) / step_s[:, None]
-    change = np.linalg.norm(np.diff(velocity, axis=0), axis=1)
-    bend_mps2[1:-1] = 2.0 * change / (step_s[1:] + step_s[:-1])
+def _bends_m(time_s: Floats, position_m: Floats, sigma_m: Floats) -> Floats:
+    """Distance (n - 1,) of the middle of every chord between places from a way that bends as its neighbours show.
+
+    What the places' errors (n, 3) make of a bend is taken from it, and no vehicle bends its way as it likes.
+    """
+    inverse_s, bend_mps2 = 1.0 / np.diff(time_s)[:, None], np.zeros(len(time_s))
+    change = np.diff(np.diff(position_m, axis=0) * inverse_s, axis=0)
+    after, before = inverse_s[1:], inverse_s[:-1]
+    noise = [sigma_m[2:] * after, sigma_m[1:-1] * (after + before), sigma_m[:-2] * before]
+    known = np.maximum((change**2).sum(axis=1) - (np.array(noise) ** 2).sum(axis=(0, 2)), 0.0)
+    step_s = np.diff(time_s)
+    bend_mps2[1:-1] = np.minimum(2.0 * np.sqrt(known) / (step_s[1:] + step_s[:-1]), HARDEST_MPS2)
     result: Floats = np.maximum(bend_mps2[1:], bend_mps2[:-1]) * step_s**2 / 8.0
     return result
 
 
-def _place_at(time_us: Ints, known_us: Ints, way_m: Floats, gap_us: Ints) -> Floats:
-    """A way (k, 3) at some times (m,); NaN where those at which it is known are as far apart as `gap_us` (m,)."""
+def _bend_on_chord_m(fraction: Floats, bend_m: Floats) -> Floats:
+    """Distance (m,) from a way at fractions of its chords, whose middles are `bend_m` away."""
+    result: Floats = 4.0 * fraction * (1.0 - fraction) * bend_m
+    return result
+
+
+def _place_at(time_us: Ints, known_us: Ints, way_m: Floats, gap_us: Ints) -> tuple[Floats, Floats]:
+    """A way (k, 3) at some times (m,), and how far it bends away from there (m,).
+
+    NaN where times at which it is known are as far apart as `gap_us` (m,).
+    """
     known = np.isfinite(way_m[:, 0])
-    result = np.full((len(time_us), 3), np.nan)
+    place_m, bend_m = np.full((len(time_us), 3), np.nan), np.full(len(time_us), np.nan)
     if known.sum() < 2:
-        return result
+        return place_m, bend_m
     at_us = known_us[known]
     after = np.clip(np.searchsorted(at_us, time_us), 1, len(at_us) - 1)
     inside = (time_us >= at_us[0]) & (time_us <= at_us[-1])
     # An end of a chord that is one of these times itself needs no other near it.
     fine = inside & ((at_us[after] - at_us[after - 1] < gap_us) | np.isin(time_us, at_us))
     for axis in range(3):
-        result[fine, axis] = np.interp(time_us[fine], at_us, way_m[known, axis])
-    return result
+        place_m[fine, axis] = np.interp(time_us[fine], at_us, way_m[known, axis])
+    fraction = (time_us - at_us[after - 1]) / (at_us[after] - at_us[after - 1])
+    bends_m = _bends_m(at_us / 1e6, way_m[known], np.zeros((len(at_us), 3)))
+    bend_m[fine] = _bend_on_chord_m(fraction, bends_m[after - 1])[fine]
+    return place_m, bend_m
 
 
 def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, *, outlier_sigmas: float) -> Bools:

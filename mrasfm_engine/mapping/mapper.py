@@ -378,7 +378,8 @@ class Mapper:
                     xy_px=self.keypoints.xy_px.take(rows, axis=0),
                     num_points=len(tracks),
                     band=None if self.state.simultaneous else self.keypoints.band[rows],
-                )
+                ),
+                free_units & self.registered,
             ),
             layout=Layout.from_free(
                 free_units & self.registered,

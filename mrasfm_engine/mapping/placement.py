@@ -35,6 +35,7 @@ from mrasfm_engine.mapping.receiver_fit import (
     most_likely_errors,
     receiver_errors,
     with_jumps,
+    without_wrong_samples,
 )
 from mrasfm_engine.mapping.receiver_jumps import AROUND, segment_of
 from mrasfm_engine.types import Floats, Ints
@@ -134,11 +135,13 @@ def place_by_gnss(
 def _positions_m(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats | None = None) -> tuple[Floats, Floats]:
     """Positions and sigmas (u, 3) at the times of all units, see `GnssTrack.at`.
 
-    With the lever arm they follow the scene between samples, which then lies where the receiver says.
+    With the lever arm they follow the scene between samples, which then lies where the receiver says, and samples that
+    jump against it are left out.
     """
     times_us, way_m = mapper.drive.timestamps_us, None
     if antenna_in_rig_m is not None:
         units = np.flatnonzero(mapper.registered)
+        gnss = without_wrong_samples(mapper, gnss, units, antenna_in_rig_m)
         way_m = np.full((len(times_us), 3), np.nan)
         way_m[units] = antenna_places_m(mapper, units, antenna_in_rig_m)
     return gnss.at(times_us, max_gap_us=round(mapper.config.gnss.max_time_gap_s * 1e6), way_m=way_m)
@@ -186,6 +189,7 @@ def reassess_positions(
     Those that were outliers of a bent trajectory come back, with the weight that they have by their sigmas. The sizes
     of their errors are those of `receiver_errors`, or, if `thorough`, of `most_likely_errors`.
     """
+    before = placement
     if placement.track is not None:
         measured, sigma = _positions_m(mapper, placement.track, placement.lever_arm_m)
         placement = replace(placement, known_m=measured, known_sigma_m=sigma)
@@ -198,7 +202,7 @@ def reassess_positions(
         outlier_sigmas=mapper.config.gnss.outlier_sigmas,
     )
     if inlier.sum() < MIN_POSITIONS:
-        return placement
+        return before
     placement = replace(placement, units=units, inlier=inlier, off_m=off_m, noise_factor=factor)
     return _with_prior(mapper, placement, thorough=thorough, clock_varies=clock_varies)
 

@@ -128,27 +128,54 @@ def with_jumps(mapper: Mapper, placement: Placement) -> Placement:
 def _jump_times_s(mapper: Mapper, placement: Placement, times_s: Floats) -> tuple[Floats, Floats]:
     """Times (k,) of the last samples before jumps of the receiver's error, and of the first ones after them.
 
-    A sample is compared with the scene at its own time: positions that are interpolated have no steps. Of samples that
-    come more often than units, those nearest to units take part.
+    Of samples that come more often than units, those nearest to units take part.
     """
     track = placement.track
     assert track is not None
-    unit_s, sample_s = float(np.median(np.diff(times_s))), track.timestamps_us / 1e6
-    rows = np.flatnonzero(track.good & (sample_s >= times_s[0]) & (sample_s <= times_s[-1]))
-    if len(rows) and placement.interval_us / 1e6 < 0.75 * unit_s:
-        rows = rows[np.unique(nearest(sample_s[rows, None], times_s[:, None])[1])]
-    # Where no unit is near, the scene says nothing of where the antenna was.
-    after = np.clip(np.searchsorted(times_s, sample_s[rows]), 1, len(times_s) - 1)
-    rows = rows[times_s[after] - times_s[after - 1] <= MAX_BETWEEN_UNITS * unit_s]
-    at_s, antenna_m = sample_s[rows], antenna_places_m(mapper, placement.units, placement.lever_arm_m)
-    there_m = np.stack([np.interp(at_s, times_s, antenna_m[:, axis]) for axis in range(3)], axis=1)
-    first = find_jumps(
-        there_m - track.position_m[rows],
-        track.sigma_m[rows],
-        at_s,
-        wander_time_s=mapper.config.gnss.wander_time_s,
-    )
+    rows, off_m = residuals_of_samples_m(mapper, track, placement.units, placement.lever_arm_m)
+    at_s = track.timestamps_us[rows] / 1e6
+    if len(rows) and placement.interval_us / 1e6 < 0.75 * float(np.median(np.diff(times_s))):
+        near = np.unique(nearest(at_s[:, None], times_s[:, None])[1])
+        rows, off_m, at_s = rows[near], off_m[near], at_s[near]
+    first = find_jumps(off_m, track.sigma_m[rows], at_s, wander_time_s=mapper.config.gnss.wander_time_s)
     return at_s[first - 1], at_s[first]
+
+
+def residuals_of_samples_m(mapper: Mapper, track: GnssTrack, units: Ints, lever_arm_m: Floats) -> tuple[Ints, Floats]:
+    """Good samples (m,) of a receiver within the times of some units, and how far (m, 3) the scene is from them.
+
+    A sample is compared with the scene at its own time: of positions that are interpolated, several have its error.
+    Where no unit is near, the scene says nothing of where the antenna was.
+    """
+    times_s, sample_s = mapper.drive.timestamps_us[units] / 1e6, track.timestamps_us / 1e6
+    if len(units) < 2:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    rows = np.flatnonzero(track.good & (sample_s >= times_s[0]) & (sample_s <= times_s[-1]))
+    after = np.clip(np.searchsorted(times_s, sample_s[rows]), 1, len(times_s) - 1)
+    rows = rows[times_s[after] - times_s[after - 1] <= MAX_BETWEEN_UNITS * float(np.median(np.diff(times_s)))]
+    antenna_m = antenna_places_m(mapper, units, lever_arm_m)
+    there_m = [np.interp(sample_s[rows], times_s, antenna_m[:, axis]) for axis in range(3)]
+    return rows, np.stack(there_m, axis=1) - track.position_m[rows]
+
+
+def without_wrong_samples(mapper: Mapper, track: GnssTrack, units: Ints, lever_arm_m: Floats) -> GnssTrack:
+    """The track without samples that jump against the scene, where these are fewer than the units (n,).
+
+    Interpolated, one of them would be a ramp over all units between its neighbours, which looks like a scene that
+    bends.
+    """
+    times_us = track.timestamps_us[track.good]
+    if len(times_us) < MIN_POSITIONS or _units_a_sample(mapper, units, float(np.median(np.diff(times_us)))) < 2:
+        return track
+    rows, off_m = residuals_of_samples_m(mapper, track, units, lever_arm_m)
+    if len(rows) < MIN_POSITIONS:
+        return track
+    fits, _ = assess_residuals(
+        off_m, track.sigma_m[rows], np.ones(len(rows), dtype=np.bool_), outlier_sigmas=mapper.config.gnss.outlier_sigmas
+    )
+    good = track.good.copy()
+    good[rows[~fits]] = False
+    return replace(track, good=good)
 
 
 def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
@@ -159,12 +186,15 @@ def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
     together would have the way between them exactly.
     """
     good = placement.inlier
-    times_s = mapper.drive.timestamps_us[placement.units[good]] / 1e6
-    # Positions between two samples are a blend of both.
-    apart = _positions_a_sample(placement, times_s)
-    sigma_m = placement.known_sigma_m[placement.units[good]] * placement.noise_factor
-    whitened = placement.off_m[good] / sigma_m
-    steps = (whitened[apart:] - whitened[:-apart]).ravel() / np.sqrt(2.0)
+    apart = _units_a_sample(mapper, placement.units[good], placement.interval_us)
+    whitened = placement.off_m[good] / placement.known_sigma_m[placement.units[good]]
+    if apart > 1 and placement.track is not None:  # positions between two samples are a blend of both
+        track = without_wrong_samples(mapper, placement.track, placement.units[good], placement.lever_arm_m)
+        rows, off_m = residuals_of_samples_m(mapper, track, placement.units[good], placement.lever_arm_m)
+        steps = np.diff(off_m / track.sigma_m[rows], axis=0)
+    else:
+        steps = whitened[apart:] - whitened[:-apart]
+    steps = steps.ravel() / (np.sqrt(2.0) * placement.noise_factor)
     white = float((np.median(np.abs(steps)) / 0.6745) ** 2) if len(steps) else 1.0
     # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
     # share a sample, which makes n half of them.
@@ -246,11 +276,11 @@ def _among_neighbours(residuals: Floats, outlier_sigmas: float) -> Bools:
     return result
 
 
-def _positions_a_sample(placement: Placement, times_s: Floats) -> int:
-    """Number of units whose positions are interpolated between the same two samples."""
-    if len(times_s) < MIN_POSITIONS:
+def _units_a_sample(mapper: Mapper, units: Ints, interval_us: float) -> int:
+    """Number of units (n,) whose positions are interpolated between the same two samples, at least one."""
+    if len(units) < MIN_POSITIONS:
         return 1
-    return max(1, round(placement.interval_us / 1e6 / float(np.median(np.diff(times_s)))))
+    return max(1, round(interval_us / float(np.median(np.diff(mapper.drive.timestamps_us[units])))))
 
 
 def antenna_places_m(mapper: Mapper, units: Ints, lever_arm_m: Floats) -> Floats:

@@ -7,7 +7,7 @@ import pytest
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import assess_directions
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, PositionPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions, solve
 from mrasfm_engine.geometry.alignment import align_similarity
@@ -179,12 +179,29 @@ def test_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> No
 def test_positions_are_no_more_certain_than_the_scale() -> None:
     """Errors that observations share, and those of lens models, change the scene's size: all places move with it."""
     case = stereo(0, units=12)
-    problem = replace(case.problem, terms=[prior_of(case.truth)])
-    found, alone = (covariances(problem, case.truth, shared_errors=shared) for shared in (True, False))
-    away_m = case.truth.unit_position_m - case.truth.unit_position_m[0]  # the first unit is held
-    np.testing.assert_allclose(found.from_fixed_m, away_m)
-    for certainty in (found, alone, alone.with_scale_error(0.1)):
-        sigma_m = np.linalg.norm(certainty.sigma_unit_position_m[1:], axis=1)
-        assert (sigma_m[-3:] > 0.9 * certainty.sigma_scale * np.linalg.norm(away_m[-3:], axis=1)).all()
-    assert alone.with_scale_error(0.1).sigma_scale == pytest.approx(np.hypot(alone.sigma_scale, 0.1))
-    assert found.sigma_scale != alone.sigma_scale
+    alone = covariances(replace(case.problem, terms=[prior_of(case.truth)]), case.truth, shared_errors=False)
+    away_m = np.linalg.norm(case.truth.unit_position_m - case.truth.unit_position_m[0], axis=1)  # the first is held
+    np.testing.assert_allclose(np.linalg.norm(alone.by_scale_m, axis=1), away_m, rtol=0.1)
+    more = alone.with_scale_error(0.1)
+    assert more.sigma_scale == pytest.approx(np.hypot(alone.sigma_scale, 0.1))
+    sigma_m = np.linalg.norm(more.sigma_unit_position_m[1:], axis=1)
+    assert (sigma_m > 0.9 * more.sigma_scale * away_m[1:]).all()
+
+
+def test_an_error_of_the_scale_moves_what_positions_leave_open() -> None:
+    """Positions at the beginning hold it, and all behind goes farther away."""
+    case = stereo(0, units=12)
+    few = np.arange(4)
+    known = PositionPrior(
+        unit=few,
+        position_m=case.truth.unit_position_m[few],
+        sigma_m=np.full((4, 3), 0.01),
+        lever_arm_m=np.zeros(3),
+    )
+    layout = replace(case.problem.layout, unit_slot=np.arange(12), num_units=12)
+    problem = replace(case.problem, layout=layout, terms=[prior_of(case.truth), known])
+    moved_m = np.linalg.norm(covariances(problem, case.truth, shared_errors=False).by_scale_m, axis=1)
+    way_m = np.linalg.norm(case.truth.unit_position_m[-1] - case.truth.unit_position_m[0])
+    assert moved_m[:4].max() < 0.35 * way_m
+    assert moved_m[-1] > 0.75 * way_m
+    assert (np.diff(moved_m[4:]) > 0.0).all()

@@ -96,15 +96,30 @@ def test_without_a_choice_it_is_the_solver(an_image: int) -> None:
     assert problem.cost(ours) == pytest.approx(problem.cost(expected), rel=1e-6)
 
 
+def seen_by(*units: np.ndarray) -> Observations:
+    """Points that are seen by some units each."""
+    unit, point = np.concatenate(units), np.repeat(np.arange(len(units)), [len(of) for of in units])
+    return Observations(
+        unit=unit, camera=np.zeros_like(unit), point=point, xy_px=np.zeros((len(unit), 2)), num_points=len(units)
+    )
+
+
 def test_of_a_point_that_very_many_units_see_some_are_taken_all_along() -> None:
     many = 3 * MOST_UNITS
-    unit = np.concatenate([np.repeat(np.arange(many), 2), np.arange(MOST_UNITS), np.repeat(np.arange(10), 60)])
-    point = np.repeat([0, 1, 2], [2 * many, MOST_UNITS, 600])
-    o = Observations(unit=unit, camera=np.zeros_like(unit), point=point, xy_px=np.zeros((len(unit), 2)), num_points=3)
-    found = thinned(o)
+    o = seen_by(np.repeat(np.arange(many), 2), np.arange(MOST_UNITS), np.repeat(np.arange(10), 60))
+    found = thinned(o, np.ones(many, dtype=np.bool_))
     np.testing.assert_array_equal(np.diff(found.first_of_point), [2 * MOST_UNITS, MOST_UNITS, 600])
     taken = np.unique(found.unit[: found.first_of_point[1]])
     assert len(taken) == MOST_UNITS
-    assert (taken[0], taken[-1]) == (0, many - 1)
-    assert np.diff(taken).max() <= 4
-    assert thinned(found) is found
+    assert taken[0] == 0
+    assert np.diff([*taken, many]).max() <= 4
+    assert thinned(found, np.ones(many, dtype=np.bool_)) is found
+
+
+def test_points_choose_the_same_units_and_none_of_those_that_are_held() -> None:
+    many = 3 * MOST_UNITS
+    o = seen_by(np.arange(many), np.arange(50, many), np.arange(many - 10))
+    found = thinned(o, np.ones(many, dtype=np.bool_))
+    assert len(np.unique(found.unit)) < 1.3 * MOST_UNITS
+    window = (np.arange(many) >= 100) & (np.arange(many) < 110)
+    assert thinned(o, window) is o

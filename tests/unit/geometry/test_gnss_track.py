@@ -252,3 +252,31 @@ def test_a_way_with_gaps_as_long_as_those_of_the_receiver_is_not_followed() -> N
     np.testing.assert_array_equal(
         gnss.at(every, max_gap_us=10**7, way_m=seldom)[0], gnss.at(every, max_gap_us=10**7)[0]
     )
+
+
+@pytest.mark.parametrize("units_hz", [10.0, 2.0, 1.2])
+def test_a_way_of_few_units_bends_between_them_as_well(units_hz: float) -> None:
+    every, samples = times_us(round(18 * units_hz), 1.0 / units_hz), times_us(17, 1.0) + 370_000
+    fine = times_us(1800, 0.01)
+    way = hard_way(fine)
+
+    def true_m(t_us: np.ndarray) -> np.ndarray:
+        return np.stack([np.interp(t_us, fine, way[:, k]) for k in range(3)], axis=1)
+
+    gnss = track(samples, true_m(samples), sigma_m=0.02)
+    following, sigma = gnss.at(every, max_gap_us=2_000_000, way_m=true_m(every))
+    inside = np.isfinite(following[:, 0])
+    off_m = np.linalg.norm(following - true_m(every), axis=1)[inside]
+    assert (off_m <= 0.02 + sigma[inside, 0]).all()
+    assert units_hz > 5.0 or off_m.max() > 0.05
+    assert units_hz < 5.0 or sigma[inside].max() < 0.04
+
+
+def test_noise_of_many_samples_is_no_bend() -> None:
+    t = times_us(400, 0.01)
+    rng = np.random.default_rng(0)
+    position = 14.0 * (t - t[0])[:, None] / 1e6 * [1.0, 0.0, 0.0] + rng.normal(size=(400, 3)) * 0.3
+    good = (np.arange(400) < 150) | (np.arange(400) >= 250)
+    _, sigma = track(t, position, sigma_m=0.3, good=good).at(t, max_gap_us=2_000_000)
+    assert sigma[150:250].min() >= 0.3
+    assert sigma[150:250].max() < 1.35  # a vehicle that brakes as hard as it can is 1.25 m off within such a gap

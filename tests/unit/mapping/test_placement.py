@@ -251,3 +251,21 @@ def test_errors_of_which_no_scatter_is_seen_scatter() -> None:
     seldom = replace(received(simulated, 0.1), good=np.isin(np.arange(UNITS), [0, UNITS - 1]))
     found = receiver_errors(mapper, place_by_gnss(mapper, seldom, ARM_M))
     assert (found.wander, found.white >= 1.0) == (0.0, True)
+
+
+@pytest.mark.parametrize("wrong", [[4], [2, 4]])
+def test_gross_errors_of_a_slow_receiver_are_told_by_the_scene(wrong: list[int]) -> None:
+    """Interpolated, one wrong sample is a ramp over all units between its neighbours."""
+    simulated = make_simulated_drive(units=61, cameras=1, points=600, travelled_m=0.8 * np.arange(61))
+    mapper = with_true_poses(make_model(simulated), simulated, range(61))
+    gnss = received(simulated, 0.3)
+    position = gnss.position_m.copy()
+    position[10 * np.array(wrong)] += [7.0, 9.0, 0.0]
+    slow_one = replace(gnss, position_m=position, good=np.arange(61) % 10 == 0)
+    placement = place_by_gnss(mapper, slow_one, ARM_M)
+    assert placement.prior is not None
+    known_m = placement.known_m[placement.prior.unit]
+    assert np.abs(known_m - received(simulated, 0.0).position_m[placement.prior.unit]).max() < 1.5
+    assert len(placement.prior.unit) >= 40
+    assert placement.errors.white == pytest.approx(1.0, abs=0.5)
+    assert placement.errors.wander == 0.0
