@@ -25,6 +25,7 @@ SEEDS = 5
 WHITE_M, WANDER_M = 0.3, 0.5
 WANDERING = Receiver(white_m=WHITE_M, wander_m=WANDER_M, declared_m=math.hypot(WHITE_M, WANDER_M))
 EVERY, POOR_M = 5, 1.0
+TENTH, FIRSTS = 10, (0, 2, 4, 6, 8)
 METRES_A_DEGREE = 111_320.0
 
 Edit = Callable[[dict[str, Any]], None]
@@ -34,6 +35,7 @@ def receivers(data: Path, work: Path) -> Iterator[Figure]:
     """Line 21."""
     yield from _wandering(data, work)
     yield from _sparse(data, work)
+    yield from _slow(data, work)
     yield from _single_camera(data, work)
 
 
@@ -81,6 +83,28 @@ def _sparse(data: Path, work: Path) -> Iterator[Figure]:
             unit="m",
             most=0.02,
         )
+
+
+def _slow(data: Path, work: Path) -> Iterator[Figure]:
+    """KITTI 01, which turns, with one position a second, as most receivers have."""
+    drive = imported(data, "kitti01", work)
+    errors = []
+    for first in FIRSTS:
+        edited = _edited(drive, work / f"kitti01, a position a second from {first}", _every(TENTH, first))
+        mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
+        errors.append(evaluate(edited.with_name(edited.name + ", scene"), edited)["metric"]["rmse_m"])
+    what = f"kitti01, one position a second, {len(FIRSTS)} choices of which: metric RMSE"
+    yield Figure(line="21", what=f"{what}, median", value=float(np.median(errors)), unit="m", most=0.15)
+    yield Figure(line="21", what=f"{what}, worst", value=max(errors), unit="m")
+
+
+def _every(step: int, first: int) -> Edit:
+    """Leave one of so many positions of the receiver."""
+
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["gnss"]["samples"] = manifest["gnss"]["samples"][first::step]
+
+    return edit
 
 
 def _single_camera(data: Path, work: Path) -> Iterator[Figure]:
