@@ -144,6 +144,7 @@ def test_a_page_outlives_the_service(open_console: Open, tmp_path: Path) -> None
         watched.expected = (
             "ERR_CONNECTION_REFUSED",
             "ERR_INCOMPLETE_CHUNKED_ENCODING",
+            "ERR_CONTENT_LENGTH_MISMATCH",
             "ERR_CONNECTION_RESET",
             "ERR_EMPTY",
         )
