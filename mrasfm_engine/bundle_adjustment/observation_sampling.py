@@ -16,7 +16,7 @@ from mrasfm_engine.bundle_adjustment.problem import Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, solve
 from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+from mrasfm_engine.types import Bools, Cancel, Floats
 
 GRID = (8, 5)  # columns and rows of cells of an image
 MOST_UNITS = 256  # free ones that see one point: an adjustment takes all of their pairs
@@ -49,7 +49,7 @@ def thinned(observations: Observations, free_units: Bools) -> Observations:
     o = observations
     # Of a row band whose motion follows from the trajectory, three units take part.
     most = MOST_UNITS if o.band is None else MOST_UNITS // 3
-    keep = _spread(o.first_of_point, o.unit, free_units, _spreading_order(len(free_units)), most)
+    keep = _spread(o.first_of_point, o.unit, free_units, most)
     if keep is None:
         return o
     return Observations(
@@ -63,21 +63,12 @@ def thinned(observations: Observations, free_units: Bools) -> Observations:
     )
 
 
-def _spreading_order(count: int) -> Ints:
-    """Places (count,) of numbers in an order whose beginning is spread over all of them, however much it is.
-
-    It is that of the numbers with their bits reversed [van der Corput's sequence].
-    """
-    number, reverse = np.arange(count), np.zeros(count, dtype=np.int64)
-    for _ in range(max(count - 1, 1).bit_length()):
-        reverse = 2 * reverse + number % 2
-        number = number // 2
-    return reverse
-
-
 @njit(cache=True, nogil=True)
-def _spread(first: Any, unit: Any, free: Any, order: Any, most: int) -> Any:
-    """Mask (n,) of observations that stay, those of the first units in the order; None where all do."""
+def _spread(first: Any, unit: Any, free: Any, most: int) -> Any:
+    """Mask (n,) of observations that stay, those of the first units in the spreading order; None where all do."""
+    bits = 1
+    while 1 << bits < len(free):
+        bits += 1
     keep, is_whole = np.ones(len(unit), np.bool_), True
     for p in range(len(first) - 1):
         begin, end = first[p], first[p + 1]
@@ -87,7 +78,7 @@ def _spread(first: Any, unit: Any, free: Any, order: Any, most: int) -> Any:
         count = 0
         for n in range(begin, end):
             if free[unit[n]]:
-                places[count] = order[unit[n]]
+                places[count] = _reversed(unit[n], bits)
                 count += 1
         different = np.unique(places[:count])
         if len(different) <= most:
@@ -95,8 +86,21 @@ def _spread(first: Any, unit: Any, free: Any, order: Any, most: int) -> Any:
         is_whole = False
         last = different[most - 1]
         for n in range(begin, end):
-            keep[n] = not free[unit[n]] or order[unit[n]] <= last
+            keep[n] = not free[unit[n]] or _reversed(unit[n], bits) <= last
     return None if is_whole else keep
+
+
+@njit(cache=True, nogil=True)
+def _reversed(number: int, bits: int) -> int:
+    """Place of a number in an order whose beginning is spread over all of them, however much of it is taken.
+
+    It is the number with its bits reversed [van der Corput's sequence].
+    """
+    place = 0
+    for _ in range(bits):
+        place = 2 * place + number % 2
+        number = number // 2
+    return place
 
 
 def choose_points(observations: Observations, free_units: Bools, image_size_px: Floats, *, an_image: int) -> Bools:

@@ -40,6 +40,11 @@ class GnssTrack:
     # (n,) repetitions of the position before, which are not good either; empty where they are not known
     held: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))
 
+    @property
+    def interval_us(self) -> float:
+        """Usual time between good samples; 0 where there are not two."""
+        return float(np.median(np.diff(self.timestamps_us[self.good]))) if self.good.sum() > 1 else 0.0
+
     def at(self, timestamps_us: Ints, *, max_gap_us: int, way_m: Floats | None = None) -> tuple[Floats, Floats]:
         """Positions and sigmas (m, 3) at other times, between good samples; NaN outside and in larger gaps.
 

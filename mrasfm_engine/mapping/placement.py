@@ -121,7 +121,7 @@ def place_by_gnss(
         units=units,
         inlier=alignment.inlier,
         off_m=antenna_places_m(mapper, units, antenna_in_rig_m) - measured[units],
-        interval_us=float(np.median(np.diff(gnss.timestamps_us[gnss.good]))) if gnss.good.sum() > 1 else 0.0,
+        interval_us=gnss.interval_us,
         noise_factor=alignment.noise_factor,
         track=gnss if mapper.config.bundle_adjustment.reassessment else None,
     )

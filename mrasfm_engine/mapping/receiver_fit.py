@@ -164,8 +164,7 @@ def without_wrong_samples(mapper: Mapper, track: GnssTrack, units: Ints, lever_a
     Interpolated, one of them would be a ramp over all units between its neighbours, which looks like a scene that
     bends.
     """
-    times_us = track.timestamps_us[track.good]
-    if len(times_us) < MIN_POSITIONS or _units_a_sample(mapper, units, float(np.median(np.diff(times_us)))) < 2:
+    if track.good.sum() < MIN_POSITIONS or _units_a_sample(mapper, units, track.interval_us) < 2:
         return track
     rows, off_m = residuals_of_samples_m(mapper, track, units, lever_arm_m)
     if len(rows) < MIN_POSITIONS:
