@@ -3,8 +3,8 @@ camera that is turned.
 
 Both are usual mistakes of recordings: the files of a camera begin a frame late, or lack one from somewhere on, or an
 image is turned by a right angle and its camera in the rig is not. Where cameras have a common view, their matches show
-it. A drive of this kind is refused with what was found: whatever is made of it hangs on a rig that the car does not
-have.
+it, or that there are none although either camera matches its own images of other times. A drive of this kind is refused
+with what was found: whatever is made of it hangs on a rig that the car does not have.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
-from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.geometry import se3
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
-from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.geometry.frustum import view_overlap
 from mrasfm_engine.matching.calibration_check import (
     CLEARLY_BETTER,
     CLEARLY_WORSE,
@@ -28,25 +28,22 @@ from mrasfm_engine.matching.calibration_check import (
     PAIR_ERROR_PX,
     share_explained,
 )
-from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
+from mrasfm_engine.matching.prepared_images import Matcher
+from mrasfm_engine.matching.relisted_images import MIN_UNITS, RelistedImages
 from mrasfm_engine.matching.simultaneous import (
     are_simultaneous,
     calibration_sigmas,
     largest_turn_rad,
     max_error_rad,
 )
-from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, relative_pose
+from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
-from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+from mrasfm_engine.types import Cancel, Floats, Ints
 
-MIN_UNITS = 3  # that follow one another: fewer neither contradict the calibration nor part others that do
 SEARCHED_UNITS = 8
-MAX_LAG = 5  # frames that images may be late
-LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
 STEADY_TURN_DEG = 1.0
-# What is drawn into all images of a camera, as the time of day, is at one place in most of them.
-DRAWN_PX, DRAWN_SHARE = 1.5, 0.5
+WIDE_VIEW = 0.5  # of both cameras' views that the other one has: such cameras' simultaneous images have matches
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,20 +87,6 @@ class _Comparison:
         return _Comparison(units=self.units[rows], shares=self.shares[rows])
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Rays:
-    """Rays (n, 3) of matches of two images, in each camera's axes, and their keypoints (n, 2)."""
-
-    a: Floats
-    b: Floats
-    xy_a_px: Floats
-    xy_b_px: Floats
-
-    def at(self, rows: Bools) -> _Rays:
-        """Some of them."""
-        return _Rays(a=self.a[rows], b=self.b[rows], xy_a_px=self.xy_a_px[rows], xy_b_px=self.xy_b_px[rows])
-
-
 def require_images_as_listed(
     drive: Drive,
     features: Sequence[ImageFeatures],
@@ -112,6 +95,7 @@ def require_images_as_listed(
     config: MatchConfig,
     calibration: BundleAdjustmentConfig,
     *,
+    max_depth_m: float,
     rig_from_cam: Floats | None = None,
     cancel: Cancel | None = None,
 ) -> None:
@@ -119,7 +103,9 @@ def require_images_as_listed(
 
     Cameras whose simultaneous images fit the calibration as given, or as corrected by all of them, cost next to
     nothing. Where they do not, all along or in units that follow one another, some of these units are matched anew,
-    each image of one camera with those of the other that were taken up to `MAX_LAG` frames before and after it.
+    each image of one camera with those of the other from up to `MAX_LAG` frames before and after it, and from farther
+    ones where most matches do not fit. A camera whose simultaneous images have no matches with any other's is matched
+    with all of them in some units: it may be given so wrong that it seems to look elsewhere.
 
     Parameters
     ----------
@@ -127,6 +113,8 @@ def require_images_as_listed(
         Of all images of the drive.
     pairs
         Verified pairs of images.
+    max_depth_m
+        How far views count that cameras may have in common.
     rig_from_cam
         Poses (c, 4, 4) of the cameras as their simultaneous images correct them.
 
@@ -136,21 +124,31 @@ def require_images_as_listed(
         Where a camera's images fit the calibration in other frames, or as those of a camera that is turned.
     """
     rigs = [drive.rig_from_cam, *([] if rig_from_cam is None else [rig_from_cam])]
-    compared = _compared(drive, features, pairs, rigs, config)
+    compared = _compared(drive, features, pairs, rigs, config, max_depth_m)
     contradicted = {cameras: run for cameras, found in compared.items() if (run := found.contradicting()) is not None}
-    if not contradicted:
+    looked_at = {**_unlinked(drive, pairs), **contradicted}
+    if not looked_at:
         return
     searches = {
-        cameras: _Search(drive, features, matcher, config, cameras, run.evenly(SEARCHED_UNITS), cancel)
-        for cameras, run in contradicted.items()
+        cameras: RelistedImages(
+            drive,
+            features,
+            matcher,
+            config,
+            cameras=cameras,
+            units=(some := run.evenly(SEARCHED_UNITS)).units,
+            listed_share=some.share,
+            cancel=cancel,
+        )
+        for cameras, run in looked_at.items()
     }
     with threadpool_limits(1, "blas"):
         turns_deg = {cameras: search.turn_deg() for cameras, search in searches.items()}
         # In a steady turn, a camera that is late looks like one that is turned, and by less than a calibration errs.
         lags = {
             cameras: lag
-            for cameras, search in searches.items()
-            if turns_deg[cameras] < STEADY_TURN_DEG and (lag := search.lag())
+            for cameras in contradicted
+            if turns_deg[cameras] < STEADY_TURN_DEG and (lag := searches[cameras].lag())
         }
         if lags:
             fit = {cameras for cameras, found in compared.items() if found.share >= CLEARLY_BETTER}
@@ -158,11 +156,34 @@ def require_images_as_listed(
             spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
             raise _late(drive, lags, agree, spans)
         sigma_rad = calibration_sigmas(drive, calibration)[0]
-        for cameras in contradicted:
+        for cameras in looked_at:
             # A turn of less is left to the calibration's own estimate, whose prior is some degrees.
             least_deg = np.degrees(largest_turn_rad(*sigma_rad[list(cameras)]))
-            if compared[cameras].share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
+            share = compared[cameras].share if cameras in compared else 0.0
+            if share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
                 raise _turned(drive, cameras, turns_deg[cameras])
+
+
+def _unlinked(drive: Drive, pairs: Sequence[PairMatches]) -> dict[tuple[int, int], _Comparison]:
+    """Pairs of cameras of which one has simultaneous matches with none, and the units that have images of both.
+
+    As a rule it looks elsewhere. So does one that is turned away by its calibration, and its matches would show it.
+    """
+    linked = {
+        drive.images[image].camera
+        for pair in pairs
+        if are_simultaneous(drive, pair.image_a, pair.image_b) and len(pair.matches) >= MIN_INLIERS
+        for image in (pair.image_a, pair.image_b)
+    }
+    image = {(one.unit, one.camera): i for i, one in enumerate(drive.images)}
+    result = {}
+    for a, b in combinations(range(len(drive.cameras)), 2):
+        if not linked >= {a, b}:
+            both = (unit for unit, camera in image if camera == a and (unit, b) in image)
+            units = np.array([u for u in both if are_simultaneous(drive, image[u, a], image[u, b])], dtype=np.int64)
+            if len(units) >= MIN_UNITS:
+                result[a, b] = _Comparison(units=units, shares=np.zeros(len(units)))
+    return result
 
 
 def _compared(
@@ -171,8 +192,13 @@ def _compared(
     pairs: Sequence[PairMatches],
     rigs: Sequence[Floats],
     config: MatchConfig,
+    max_depth_m: float,
 ) -> dict[tuple[int, int], _Comparison]:
-    """Shares of their matches by which pairs of cameras with a common view fit the rig that explains them best."""
+    """Shares of their matches by which pairs of cameras with a common view fit the rig that explains them best.
+
+    Units whose images have no matches, although the cameras have most of their views in common and both images match
+    others, fit none.
+    """
     kinds, params = pack_cameras(drive.cameras)
     focal_px = params[:, :2].mean(1)
     by_cameras: dict[tuple[int, int], list[PairMatches]] = {}
@@ -180,10 +206,12 @@ def _compared(
         if are_simultaneous(drive, pair.image_a, pair.image_b) and len(pair.matches) >= MIN_INLIERS:
             cameras = drive.images[pair.image_a].camera, drive.images[pair.image_b].camera
             by_cameras.setdefault(cameras, []).append(pair)
+    expected = _units_with_common_view(drive, pairs, max_depth_m)
     result = {}
-    for (a, b), found in sorted(by_cameras.items()):
-        shares, units, gate = [], [], PAIR_ERROR_PX / float(focal_px[[a, b]].min())
-        for pair in sorted(found, key=lambda pair: drive.images[pair.image_a].unit):
+    for a, b in sorted(by_cameras.keys() | expected.keys()):
+        shares = dict.fromkeys(expected.get((a, b), ()), [0.0] * len(rigs))
+        gate = PAIR_ERROR_PX / float(focal_px[[a, b]].min())
+        for pair in by_cameras.get((a, b), ()):
             rays_a, rays_b = (
                 unproject_pixels(int(kinds[camera]), params[camera], features[image].xy_px[rows])
                 for camera, image, rows in zip((a, b), (pair.image_a, pair.image_b), pair.matches.T, strict=True)
@@ -193,12 +221,44 @@ def _compared(
                 max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config)
                 kept = essential_inliers(rays_a, rays_b, max_error=max_error)
             if kept.sum() >= MIN_INLIERS:
-                shares.append([share_explained(rig[a], rig[b], rays_a[kept], rays_b[kept], gate) for rig in rigs])
-                units.append(drive.images[pair.image_a].unit)
+                unit = drive.images[pair.image_a].unit
+                shares[unit] = [share_explained(rig[a], rig[b], rays_a[kept], rays_b[kept], gate) for rig in rigs]
         if len(shares) >= MIN_UNITS:
-            of_rig = np.array(shares).T
+            of_rig = np.array([shares[unit] for unit in sorted(shares)]).T
             best = int(np.argmax(np.median(of_rig, axis=1)))
-            result[a, b] = _Comparison(units=np.array(units, dtype=np.int64), shares=of_rig[best])
+            result[a, b] = _Comparison(units=np.array(sorted(shares), dtype=np.int64), shares=of_rig[best])
+    return result
+
+
+def _units_with_common_view(
+    drive: Drive, pairs: Sequence[PairMatches], max_depth_m: float
+) -> dict[tuple[int, int], list[int]]:
+    """Units in which simultaneous images should have matches, by the cameras that have most of their views in common.
+
+    Both images match others of their own cameras: neither is dark, covered or blurred.
+    """
+    cameras = np.arange(len(drive.cameras))
+    kinds, params = pack_cameras(drive.cameras)
+    both = np.stack(np.triu_indices(len(cameras), 1), 1)
+    overlap = view_overlap(
+        both,
+        world_from_cam=drive.rig_from_cam,
+        camera=cameras,
+        kind=kinds,
+        params=params,
+        size_px=np.array([(camera.width, camera.height) for camera in drive.cameras]),
+        max_depth_m=max_depth_m,
+    )
+    clear = {
+        (drive.images[image].unit, drive.images[image].camera): image
+        for pair in pairs
+        if drive.images[pair.image_a].camera == drive.images[pair.image_b].camera and pair.inliers.sum() >= MIN_INLIERS
+        for image in (pair.image_a, pair.image_b)
+    }
+    result: dict[tuple[int, int], list[int]] = {}
+    for a, b in both[overlap >= WIDE_VIEW].tolist():
+        units = [unit for unit, camera in clear if camera == a and (unit, b) in clear]
+        result[a, b] = [unit for unit in units if are_simultaneous(drive, clear[unit, a], clear[unit, b])]
     return result
 
 
@@ -209,114 +269,6 @@ def _span(drive: Drive, compared: _Comparison, run: _Comparison) -> str:
     if begins:
         return f" from {first_us} us {f'to {last_us} us' if ends else 'on'}"
     return f" until {last_us} us" if ends else ""
-
-
-class _Search:
-    """Matches of two cameras' images that are listed in different frames, or as those of differently turned cameras."""
-
-    def __init__(
-        self,
-        drive: Drive,
-        features: Sequence[ImageFeatures],
-        matcher: Matcher,
-        config: MatchConfig,
-        cameras: tuple[int, int],
-        listed: _Comparison,
-        cancel: Cancel | None,
-    ) -> None:
-        self._drive, self._matcher, self._config, self._cancel = drive, matcher, config, cancel
-        self._rig = drive.rig_from_cam[list(cameras)]
-        self._focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(1)
-        self._gate = PAIR_ERROR_PX / float(self._focal_px[list(cameras)].min())
-        self._listed = listed
-        where = {(image.unit, image.camera): i for i, image in enumerate(drive.images)}
-        # By unit: an image is prepared once.
-        self._pairs = [
-            (lag, where[u, cameras[0]], where[u + lag, cameras[1]])
-            for u in listed.units.tolist()
-            for lag in range(-MAX_LAG, MAX_LAG + 1)
-            if (u, cameras[0]) in where and (u + lag, cameras[1]) in where
-        ]
-        pairs = np.array([(a, b) for _, a, b in self._pairs], dtype=np.int64)
-        self._images = PreparedImages(drive, features, matcher, pairs, threads=1)
-        self._keypoints = features
-
-    def lag(self) -> int:
-        """Frames by which the second camera's images come after those of the first that they fit; 0 for none.
-
-        They have to fit well there, and far better than as they are listed. Epipolar lines alone tell: of far points,
-        noise decides whether they are before the cameras.
-        """
-        found: dict[int, list[float]] = {}
-        b_from_a = se3.inverse(self._rig[1]) @ self._rig[0]
-        for lag, a, b in self._pairs:
-            rays = self._verified(a, b)
-            if rays is not None:
-                near = epipolar_errors(b_from_a, rays.a, rays.b) < self._gate
-                found.setdefault(lag, []).append(float(near.mean()))
-        shares = {lag: float(np.median(some)) for lag, some in found.items() if len(some) >= MIN_UNITS}
-        listed = shares.pop(0, self._listed.share)
-        if listed >= CLEARLY_BETTER:
-            return 0
-        best = max(shares, key=lambda lag: (shares[lag], -abs(lag), lag), default=0)
-        left = 1.0 - shares.get(best, 0.0)
-        return best if left <= min(1.0 - CLEARLY_BETTER, LEFT_SHARE * (1.0 - listed)) else 0
-
-    def turn_deg(self) -> float:
-        """Angle by which images show two cameras turned against each other from where they are given; 0 for none."""
-        pairs = [(a, b) for lag, a, b in self._pairs if lag == 0]
-        rays = _without_drawn([one for a, b in pairs if (one := self._verified(a, b)) is not None])
-        if len(rays) < MIN_UNITS:
-            return 0.0
-        max_error = max_error_rad(self._drive, pairs[0][0], pairs[0][1], self._focal_px, self._config)
-        b_from_a = _common_rotation([one.a for one in rays], [one.b for one in rays], max_error)
-        if b_from_a is None:
-            return 0.0
-        given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
-        return float(se3.rotation_angle_deg(given.T @ b_from_a))
-
-    def _verified(self, image_a: int, image_b: int) -> _Rays | None:
-        """Rays of the matches that agree with an essential matrix; None where they are few."""
-        if self._cancel is not None and self._cancel():
-            raise CancelledError
-        of_a, of_b = (self._images.prepared(image).for_matcher for image in (image_a, image_b))
-        matches = self._matcher.match(of_a, of_b)
-        parts = [
-            (self._images.rays(image)[rows], self._keypoints[image].xy_px[rows])
-            for image, rows in zip((image_a, image_b), matches.T, strict=True)
-        ]
-        found = _Rays(a=parts[0][0], b=parts[1][0], xy_a_px=parts[0][1], xy_b_px=parts[1][1])
-        max_error = max_error_rad(self._drive, image_a, image_b, self._focal_px, self._config)
-        good = essential_inliers(found.a, found.b, max_error=max_error)
-        return found.at(good) if good.sum() >= MIN_INLIERS else None
-
-
-def _without_drawn(units: Sequence[_Rays]) -> list[_Rays]:
-    """Units with enough matches besides those of what is at one place in most images of either camera.
-
-    A vehicle that stands shows nothing else.
-    """
-    result = []
-    for k, one in enumerate(units):
-        moves = np.ones(len(one.a), dtype=np.bool_)
-        for of, others in (
-            (one.xy_a_px, [other.xy_a_px for j, other in enumerate(units) if j != k]),
-            (one.xy_b_px, [other.xy_b_px for j, other in enumerate(units) if j != k]),
-        ):
-            there = [np.isfinite(nearest(other, of, within_m=DRAWN_PX)[0][:, 0]) for other in others]
-            moves &= np.mean([np.zeros(len(of)), *there], axis=0) < DRAWN_SHARE
-        if moves.sum() >= MIN_INLIERS:
-            result.append(one.at(moves))
-    return result
-
-
-def _common_rotation(rays_a: Sequence[Floats], rays_b: Sequence[Floats], max_error: float) -> Floats | None:
-    """The rotation b_from_a (3, 3) of one essential matrix that nearly all matches of all units agree with."""
-    a, b = np.concatenate(rays_a), np.concatenate(rays_b)
-    good = essential_inliers(a, b, max_error=max_error)
-    # The matches of each unit have a matrix that they agree with; one of all shows that the cameras are fixed.
-    pose = relative_pose(a[good], b[good], max_error=max_error) if good.mean() >= CLEARLY_BETTER else None
-    return None if pose is None else pose[0]
 
 
 def _late(

@@ -62,6 +62,7 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
             run.components.matcher,
             run.config.matching,
             run.config.bundle_adjustment,
+            max_depth_m=run.config.pairs.max_depth_m,
             rig_from_cam=result.rig.rig_from_cam,
             cancel=run.cancel,
         )

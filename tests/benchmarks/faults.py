@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from scipy.spatial.transform import Rotation
+
 from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
@@ -61,9 +63,11 @@ def faults(data: Path, work: Path) -> Iterator[Figure]:
         yield Figure(line="18", what=what, value=value, unit="m", most=0.1)
         yield exactly("18", f"kitti06, {title}: the finding repeated-images", int("repeated-images" in codes), 1)
     for title, edit, said in (
-        ("a camera one frame late", _late, "listed 1 frame before them"),
+        ("a camera one frame late", _late(1), "listed 1 frame before them"),
+        ("a camera twenty frames late", _late(20), "listed 20 frames before them"),
         ("a camera without one of its frames", _without_a_frame, "listed 1 frame after them from 2500000 us on"),
-        ("a camera upside down", _upside_down, "turned by 180 deg against each other"),
+        ("a camera upside down", _turned("z", 180.0), "turned by 180 deg against each other"),
+        ("a camera given as if it looked up", _turned("x", 60.0), "turned by 60 deg against each other"),
     ):
         refused = edited(drive, work / f"kitti06, {title}, drive", [edit])
         try:
@@ -125,12 +129,15 @@ def _scaled_baselines(factor: float) -> Edit:
     return edit
 
 
-def _late(manifest: dict[str, Any]) -> None:
-    """Every frame has the image of a camera that is the one before its own; the first has none."""
-    files = [frame["images"][LATE] for frame in manifest["frames"]]
-    for frame, before in zip(manifest["frames"][1:], files[:-1], strict=True):
-        frame["images"][LATE] = before
-    del manifest["frames"][0]["images"][LATE]
+def _late(count: int) -> Edit:
+    """Every frame has the image of a camera that is so many frames before its own; the first ones have none."""
+
+    def edit(manifest: dict[str, Any]) -> None:
+        files = [frame["images"].pop(LATE) for frame in manifest["frames"]]
+        for frame, before in zip(manifest["frames"][count:], files[:-count], strict=True):
+            frame["images"][LATE] = before
+
+    return edit
 
 
 def _without_a_frame(manifest: dict[str, Any]) -> None:
@@ -143,10 +150,14 @@ def _without_a_frame(manifest: dict[str, Any]) -> None:
     del frames[-1]["images"][LATE]
 
 
-def _upside_down(manifest: dict[str, Any]) -> None:
-    """A camera is said to be turned about its axis: x and y of it are the other way round."""
-    for camera in manifest["rig"]["cameras"]:
-        if camera["name"] == LATE:
-            x, y, z, w = camera["rig_from_cam"]["rotation_xyzw"]
-            # The quaternion times (0, 0, 1, 0), a half turn about z.
-            camera["rig_from_cam"]["rotation_xyzw"] = [y, -x, w, -z]
+def _turned(axis: str, turn_deg: float) -> Edit:
+    """A camera is said to be turned about an axis of its own."""
+
+    def edit(manifest: dict[str, Any]) -> None:
+        for camera in manifest["rig"]["cameras"]:
+            if camera["name"] == LATE:
+                given = Rotation.from_quat(camera["rig_from_cam"]["rotation_xyzw"])
+                wrong = given * Rotation.from_euler(axis, turn_deg, degrees=True)
+                camera["rig_from_cam"]["rotation_xyzw"] = wrong.as_quat().tolist()
+
+    return edit

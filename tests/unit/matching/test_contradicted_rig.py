@@ -11,9 +11,10 @@ import pytest
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.contradicted_rig import MAX_LAG, require_images_as_listed
+from mrasfm_engine.matching.contradicted_rig import require_images_as_listed
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
 from mrasfm_engine.matching.pair_matching import match_pairs
+from mrasfm_engine.matching.relisted_images import MAX_LAG
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import make_drive, random_descriptors
@@ -44,7 +45,7 @@ class Street:
                 (i, j)
                 for i, a in enumerate(images)
                 for j, b in enumerate(images)
-                if i < j and a.unit == b.unit and a.camera != b.camera
+                if i < j and (a.unit == b.unit or (a.camera == b.camera and b.unit == a.unit + 1))
             ]
         )
         matcher = NearestNeighbourMatcher(CONFIG)
@@ -56,6 +57,7 @@ class Street:
             matcher,
             CONFIG,
             self.calibration,
+            max_depth_m=50.0,
             rig_from_cam=found.rig.rig_from_cam,
             cancel=lambda: cancel,
         )
@@ -64,9 +66,10 @@ class Street:
 def street(
     *,
     cameras: int = 2,
+    units: int = UNITS,
     late: int | None = None,
     lag: int = 0,
-    late_units: Collection[int] = range(UNITS),
+    late_units: Collection[int] | None = None,
     true: np.ndarray | None = None,
     points: np.ndarray | None = None,
     noise_px: float = 0.3,
@@ -74,20 +77,21 @@ def street(
     speed_m: float = 1.2,
     turn_deg: float = 1.7,
     steady: bool = False,
+    seed: int = 0,
 ) -> Street:
     """Images of a street; those of the camera `late` were taken `lag` frames before the ones they are listed with,
     in some units."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     true = looking_ahead(cameras) if true is None else true
     params = np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * cameras)
-    drive = make_drive(true if given is None else given, params, units=UNITS)
+    drive = make_drive(true if given is None else given, params, units=units)
     side = rng.choice([-1.0, 1.0], POINTS)
     if points is None:
         x, y, z = rng.uniform(-10, 60, POINTS), side * rng.uniform(4, 12, POINTS), rng.uniform(-1, 8, POINTS)
         points = np.stack([x, y, z], 1)
     descriptors, features = random_descriptors(POINTS, rng), []
     for image in drive.images:
-        unit = image.unit - (lag if image.camera == late and image.unit in late_units else 0)
+        unit = image.unit - (lag if image.camera == late and image.unit in (late_units or range(units)) else 0)
         # It turns, and not always by as much: else a lag looks like a camera that is mounted otherwise.
         heading = np.radians(turn_deg) * (unit + (0.0 if steady else 2.0 * np.sin(0.9 * unit)))
         vehicle = se3.transform(se3.exp_so3([0.0, 0.0, heading]), [speed_m * unit, 0.5 * speed_m * heading * unit, 0.0])
@@ -125,6 +129,22 @@ def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag:
     frames = "1 frame" if abs(lag) == 1 else f"{abs(lag)} frames"
     assert f"listed {frames} {'before' if lag > 0 else 'after'} them, and not" in caught.value.what
     assert frames in caught.value.remedy
+
+
+@pytest.mark.parametrize("lag", [MAX_LAG + 1, 13, -20])
+def test_a_camera_that_is_late_by_so_much_that_it_sees_other_things_is_refused_with_the_number(lag: int) -> None:
+    with pytest.raises(InputError) as caught:
+        street(units=40, late=1, lag=lag, speed_m=0.8, turn_deg=0.4).check()
+    assert caught.value.code == "camera-late"
+    assert f"listed {abs(lag)} frames {'before' if lag > 0 else 'after'} them, and not" in caught.value.what
+
+
+def test_cameras_that_match_nowhere_are_not_late() -> None:
+    """One of them looks through a filter, as it were: both match themselves, and neither the other."""
+    made = street(units=24, speed_m=0.8, turn_deg=0.4)
+    other = street(units=24, speed_m=0.8, turn_deg=0.4, seed=1)
+    images = zip(made.drive.images, made.features, other.features, strict=True)
+    Street(made.drive, [b if image.camera == 1 else a for image, a, b in images]).check()
 
 
 @pytest.mark.parametrize(
@@ -183,7 +203,16 @@ def test_of_three_cameras_the_late_one_is_named() -> None:
 
 @pytest.mark.parametrize(
     ("axis", "turn_deg"),
-    [((0, 0, 1), 180.0), ((0, 0, 1), 90.0), ((0, 1, 0), 45.0), ((1, 0, 0), 22.0), ((0, 0, 1), 25.0)],
+    [
+        ((0, 0, 1), 180.0),
+        ((0, 0, 1), 90.0),
+        ((0, 1, 0), 45.0),
+        ((1, 0, 0), 22.0),
+        ((0, 0, 1), 25.0),
+        ((0, 1, 0), 90.0),
+        ((0, 1, 0), 180.0),
+        ((1, 0, 0), 60.0),
+    ],
 )
 def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_angle(
     axis: tuple[float, float, float], turn_deg: float
@@ -192,6 +221,11 @@ def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_
         street(given=turned(1, axis, turn_deg)).check()
     assert caught.value.code == "camera-turned"
     assert f"turned by {turn_deg:.0f} deg" in caught.value.what
+
+
+def test_cameras_that_look_apart_pass() -> None:
+    street(true=turned(1, (0, 1, 0), 180.0)).check()
+    street(true=turned(1, (0, 1, 0), 90.0)).check()
 
 
 @pytest.mark.parametrize("turn_deg", [1.0, 5.0, 18.0])
@@ -249,4 +283,6 @@ def test_a_drive_of_one_camera_has_nothing_to_compare() -> None:
     pairs = np.array([(i, i + 1) for i in range(UNITS - 1)])
     found = match_pairs(made.drive, made.features, pairs, matcher, CONFIG, made.calibration, threads=1)
     assert found.pairs
-    require_images_as_listed(made.drive, made.features, found.pairs, matcher, CONFIG, made.calibration)
+    require_images_as_listed(
+        made.drive, made.features, found.pairs, matcher, CONFIG, made.calibration, max_depth_m=50.0
+    )

@@ -1,0 +1,199 @@
+"""Images of two cameras, matched in other frames than those that list them, or as those of cameras turned otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from mrasfm_engine.config import MatchConfig
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.camera_model import pack_cameras
+from mrasfm_engine.geometry.neighbours import nearest
+from mrasfm_engine.matching.calibration_check import CLEARLY_BETTER, CLEARLY_WORSE, MIN_INLIERS, PAIR_ERROR_PX
+from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
+from mrasfm_engine.matching.simultaneous import max_error_rad
+from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, relative_pose
+from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.scene import ImageFeatures
+from mrasfm_engine.types import Bools, Cancel, Floats, Ints
+
+MIN_UNITS = 3  # that follow one another: fewer neither contradict the calibration nor part others that do
+MAX_LAG = 5  # frames that images are late as a rule: all of these are looked at
+# Images may be late by seconds as well, as where a recorder began later. Where most does not fit, every third frame
+# is looked at in some units: images that are a frame apart or two show much the same.
+FARTHEST_LAG, LAG_STEP, SCANNED_UNITS = 60, 3, 4
+LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
+# What is drawn into all images of a camera, as the time of day, is at one place in most of them.
+DRAWN_PX, DRAWN_SHARE = 1.5, 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Rays:
+    """Rays (n, 3) of matches of two images, in each camera's axes, and their keypoints (n, 2)."""
+
+    a: Floats
+    b: Floats
+    xy_a_px: Floats
+    xy_b_px: Floats
+
+    def at(self, rows: Bools) -> _Rays:
+        """Some of them."""
+        return _Rays(a=self.a[rows], b=self.b[rows], xy_a_px=self.xy_a_px[rows], xy_b_px=self.xy_b_px[rows])
+
+
+class RelistedImages:
+    """Matches of two cameras' images whatever frames list them.
+
+    Parameters
+    ----------
+    features
+        Of all images of the drive.
+    cameras
+        Indices of both.
+    units
+        Some units (n,) in which the images contradict the calibration.
+    listed_share
+        Share of the matches there that fits it.
+    """
+
+    def __init__(
+        self,
+        drive: Drive,
+        features: Sequence[ImageFeatures],
+        matcher: Matcher,
+        config: MatchConfig,
+        *,
+        cameras: tuple[int, int],
+        units: Ints,
+        listed_share: float,
+        cancel: Cancel | None = None,
+    ) -> None:
+        self._drive, self._matcher, self._config, self._cancel = drive, matcher, config, cancel
+        self._cameras, self._units, self._listed_share = cameras, units, listed_share
+        self._rig = drive.rig_from_cam[list(cameras)]
+        self._focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(1)
+        self._gate = PAIR_ERROR_PX / float(self._focal_px[list(cameras)].min())
+        self._where = {(image.unit, image.camera): i for i, image in enumerate(drive.images)}
+        near = [(a, b) for _, a, b in self._pairs(units, range(-MAX_LAG, MAX_LAG + 1))]
+        self._images = PreparedImages(drive, features, matcher, np.array(near, dtype=np.int64), threads=1)
+        self._keypoints = features
+
+    def lag(self) -> int:
+        """Frames by which the second camera's images come after those of the first that they fit; 0 for none.
+
+        They have to fit well there, and far better than as they are listed.
+        """
+        shares = self._shares(range(-MAX_LAG, MAX_LAG + 1))
+        listed_share = shares.pop(0, self._listed_share)
+        if listed_share >= CLEARLY_BETTER:
+            return 0
+        lag = _best(shares, listed_share)
+        if lag == 0 and listed_share < CLEARLY_WORSE and (far := self._scan()):
+            lag = _best(self._shares(range(far - LAG_STEP, far + LAG_STEP + 1)), listed_share)
+        return lag
+
+    def turn_deg(self) -> float:
+        """Angle by which images show two cameras turned against each other from where they are given; 0 for none."""
+        pairs = [(a, b) for _, a, b in self._pairs(self._units, (0,))]
+        rays = _without_drawn([one for a, b in pairs if (one := self._verified(a, b)) is not None])
+        if len(rays) < MIN_UNITS:
+            return 0.0
+        max_error = max_error_rad(self._drive, pairs[0][0], pairs[0][1], self._focal_px, self._config)
+        b_from_a = _common_rotation([one.a for one in rays], [one.b for one in rays], max_error)
+        if b_from_a is None:
+            return 0.0
+        given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
+        return float(se3.rotation_angle_deg(given.T @ b_from_a))
+
+    def _pairs(self, units: Ints, lags: Iterable[int]) -> list[tuple[int, int, int]]:
+        """Lag and images, by unit: an image is prepared once."""
+        lags, (first, second) = tuple(lags), self._cameras
+        return [
+            (lag, self._where[u, first], self._where[u + lag, second])
+            for u in units.tolist()
+            for lag in lags
+            if (u, first) in self._where and (u + lag, second) in self._where
+        ]
+
+    def _shares(self, lags: Iterable[int]) -> dict[int, float]:
+        """Median share of the matches that fits the calibration, by lag.
+
+        Epipolar lines alone tell: of far points, noise decides whether they are before the cameras.
+        """
+        found: dict[int, list[float]] = {}
+        for lag, a, b in self._pairs(self._units, lags):
+            rays = self._verified(a, b)
+            if rays is not None:
+                found.setdefault(lag, []).append(float(self._near(rays).mean()))
+        return {lag: float(np.median(some)) for lag, some in found.items() if len(some) >= MIN_UNITS}
+
+    def _scan(self) -> int:
+        """The lag, by steps, at which most matches of some units fit the calibration; 0 where none do."""
+        count = min(SCANNED_UNITS, len(self._units))
+        units = self._units[np.linspace(0, len(self._units) - 1, count).round().astype(np.int64)]
+        beyond = range(MAX_LAG + 1, FARTHEST_LAG + 1, LAG_STEP)
+        fit: dict[int, list[int]] = {}
+        for lag, a, b in self._pairs(units, [*beyond, *(-lag for lag in beyond)]):
+            rays = self._verified(a, b)
+            fit.setdefault(lag, []).append(0 if rays is None else int(self._near(rays).sum()))
+        mean = {lag: float(np.mean(some)) for lag, some in fit.items()}
+        best = max(mean, key=lambda lag: (mean[lag], -abs(lag), lag), default=0)
+        return best if mean.get(best) else 0
+
+    def _near(self, rays: _Rays) -> Bools:
+        """Matches (n,) that lie near their epipolar lines."""
+        near: Bools = epipolar_errors(se3.inverse(self._rig[1]) @ self._rig[0], rays.a, rays.b) < self._gate
+        return near
+
+    def _verified(self, image_a: int, image_b: int) -> _Rays | None:
+        """Rays of the matches that agree with an essential matrix; None where they are few."""
+        if self._cancel is not None and self._cancel():
+            raise CancelledError
+        of_a, of_b = (self._images.prepared(image).for_matcher for image in (image_a, image_b))
+        matches = self._matcher.match(of_a, of_b)
+        parts = [
+            (self._images.rays(image)[rows], self._keypoints[image].xy_px[rows])
+            for image, rows in zip((image_a, image_b), matches.T, strict=True)
+        ]
+        found = _Rays(a=parts[0][0], b=parts[1][0], xy_a_px=parts[0][1], xy_b_px=parts[1][1])
+        max_error = max_error_rad(self._drive, image_a, image_b, self._focal_px, self._config)
+        good = essential_inliers(found.a, found.b, max_error=max_error)
+        return found.at(good) if good.sum() >= MIN_INLIERS else None
+
+
+def _best(shares: dict[int, float], listed_share: float) -> int:
+    """The lag at which nearly all matches fit, and few of those that contradict the calibration; 0 for none."""
+    best = max(shares, key=lambda lag: (shares[lag], -abs(lag), lag), default=0)
+    left = 1.0 - shares.get(best, 0.0)
+    return best if left <= min(1.0 - CLEARLY_BETTER, LEFT_SHARE * (1.0 - listed_share)) else 0
+
+
+def _without_drawn(units: Sequence[_Rays]) -> list[_Rays]:
+    """Units with enough matches besides those of what is at one place in most images of either camera.
+
+    A vehicle that stands shows nothing else.
+    """
+    result = []
+    for k, one in enumerate(units):
+        moves = np.ones(len(one.a), dtype=np.bool_)
+        for of, others in (
+            (one.xy_a_px, [other.xy_a_px for j, other in enumerate(units) if j != k]),
+            (one.xy_b_px, [other.xy_b_px for j, other in enumerate(units) if j != k]),
+        ):
+            there = [np.isfinite(nearest(other, of, within_m=DRAWN_PX)[0][:, 0]) for other in others]
+            moves &= np.mean([np.zeros(len(of)), *there], axis=0) < DRAWN_SHARE
+        if moves.sum() >= MIN_INLIERS:
+            result.append(one.at(moves))
+    return result
+
+
+def _common_rotation(rays_a: Sequence[Floats], rays_b: Sequence[Floats], max_error: float) -> Floats | None:
+    """The rotation b_from_a (3, 3) of one essential matrix that nearly all matches of all units agree with."""
+    a, b = np.concatenate(rays_a), np.concatenate(rays_b)
+    good = essential_inliers(a, b, max_error=max_error)
+    # The matches of each unit have a matrix that they agree with; one of all shows that the cameras are fixed.
+    pose = relative_pose(a[good], b[good], max_error=max_error) if good.mean() >= CLEARLY_BETTER else None
+    return None if pose is None else pose[0]
