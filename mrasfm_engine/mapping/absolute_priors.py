@@ -16,14 +16,9 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import (
-    compare_rough_poses,
-    place_by_gnss,
-    place_by_rough_poses,
-    positions_of_units,
-    reassess_positions,
-)
+from mrasfm_engine.mapping.placement import place_by_gnss, positions_of_units, reassess_positions
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
+from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.types import Bools, Floats, Ints
 

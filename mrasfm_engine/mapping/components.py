@@ -32,7 +32,8 @@ from mrasfm_engine.mapping.incremental_mapping import (
 )
 from mrasfm_engine.mapping.loop_closure import MIN_SUPPORT, largest_agreement, seen_again, split_pairs
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import between_poses, move, place_by_gnss, place_by_rough_poses, positions_fit
+from mrasfm_engine.mapping.placement import move, place_by_gnss, positions_fit
+from mrasfm_engine.mapping.rough_placement import between_poses, place_by_rough_poses
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks

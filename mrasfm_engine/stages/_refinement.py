@@ -18,7 +18,7 @@ from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import jump_findings, refusal_findings
+from mrasfm_engine.mapping.receiver_findings import jump_findings, refusal_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory

@@ -16,7 +16,8 @@ from mrasfm_engine.mapping.absolute_priors import LOCAL_POSITIONS, AbsolutePrior
 from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import jump_findings, place_by_gnss
+from mrasfm_engine.mapping.placement import place_by_gnss
+from mrasfm_engine.mapping.receiver_findings import jump_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import RoughPose, RoughTrajectory

@@ -20,8 +20,8 @@ from mrasfm_engine.mapping.calibration import (
     sigma_scale_of_images,
 )
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import place_by_rough_poses
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.rough_placement import place_by_rough_poses
 from mrasfm_engine.matching.verification import parallax_rad
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
 

@@ -13,7 +13,8 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import place_by_gnss, refusal_findings
+from mrasfm_engine.mapping.placement import place_by_gnss
+from mrasfm_engine.mapping.receiver_findings import refusal_findings
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors, most_likely_errors, receiver_errors
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement

@@ -1,0 +1,104 @@
+"""Findings on a receiver: why it is not used, jumps of its error, its clock, and a rig whose scale it contradicts."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.mapping.calibration import scale_of_baselines
+from mrasfm_engine.mapping.georeferencing import clock_offset, rigid_motions
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.receiver_fit import Placement, antenna_places_m
+from mrasfm_engine.mapping.receiver_jumps import AROUND
+from mrasfm_engine.types import Floats
+from schemas.findings import Finding, error, warning
+
+MIN_CLOCK_OFFSET_S = 0.05
+CLOCK_OFFSET_SIGMAS = 5.0
+MAX_SCALE_DISAGREEMENT = 0.05  # rigs are better known, whatever the default prior says; and as many of the receiver's
+SCALE_DISAGREEMENT_SIGMAS = 3.0
+
+
+def refusal_findings(placement: Placement) -> list[Finding]:
+    """The finding that the receiver's positions take no part, and why.
+
+    Where they contradict the rig's lengths alone, one of both is wrong, and the scene has the rig's: an error.
+    """
+    if placement.prior is not None or not placement.reason:
+        return []
+    what = f"positions of the receiver are not used, and the scene is not georeferenced: {placement.reason}"
+    if placement.is_of_another_scale:
+        remedy = (
+            "Check the units of rig.cameras (metres) and of gnss.samples (degrees, metres): all lengths of the scene "
+            "are those of the rig, and as wrong as it is."
+        )
+        return [error("gnss-contradicts-rig", what, remedy)]
+    remedy = "Check gnss.samples: their clock, the order of latitude and longitude, and the stated sigmas."
+    return [warning("gnss-not-used", what, remedy)]
+
+
+def jump_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
+    """The finding that the receiver's error jumps, with where it does so most."""
+    if not len(placement.jumps):
+        return []
+    good = np.flatnonzero(placement.inlier)
+    at = np.searchsorted(placement.units[good], placement.jumps)
+    off_m = placement.off_m[good]
+    sizes_m = [_step_m(off_m, k) for k in at.tolist()]
+    largest = int(np.argmax(sizes_m))
+    times_us = mapper.drive.timestamps_us[placement.jumps]
+    return [
+        warning(
+            "gnss-error-jumps",
+            f"positions of the receiver jump by about {sizes_m[largest]:.1f} m at {times_us[largest]} us and stay there"
+            + (f"; there are {len(times_us)} such places" if len(times_us) > 1 else ""),
+            "Nothing needs to be done: errors before and after it are taken as independent. Receivers that lose their "
+            "fix do this; where the scene lies is less certain.",
+        )
+    ]
+
+
+def _step_m(off_m: Floats, k: int) -> float:
+    """Distance between the residuals (n, 3) before sample k and those from it on."""
+    before, after = off_m[max(0, k - AROUND) : k], off_m[k : k + AROUND]
+    return float(np.linalg.norm(np.median(after, axis=0) - np.median(before, axis=0))) if 0 < k < len(off_m) else 0.0
+
+
+def clock_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
+    """The finding that a receiver's clock is clearly off the images'."""
+    positions = placement.prior
+    assert positions is not None
+    antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
+    scale = placement.scale_of_rig * scale_of_baselines(mapper)[0]
+    offset = clock_offset(antenna_m.mean(0) + scale * (antenna_m - antenna_m.mean(0)), positions)
+    if offset is None or abs(offset[0]) <= max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
+        return []
+    direction = "ahead of" if offset[0] > 0 else "behind"
+    return [
+        warning(
+            "gnss-clock-offset",
+            f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
+            f"(sigma {offset[1]:.2f} s)",
+            "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
+        )
+    ]
+
+
+def scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
+    """The finding that the receiver contradicts the rig's scale."""
+    positions = placement.prior
+    assert positions is not None
+    antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
+    centred_m = antenna_m - antenna_m.mean(0)
+    known = positions.information_given(centred_m, rigid_motions(centred_m))
+    sigma = 1.0 / np.sqrt(max(known, 1e-12))
+    if abs(placement.scale_of_rig - 1.0) <= max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
+        return []
+    return [
+        warning(
+            "scale-disagreement",
+            f"GNSS makes the way {placement.scale_of_rig:.3g} times as long as the rig as given does, whose "
+            f"baselines are taken to be known to {scale_of_baselines(mapper)[1]:.1%}",
+            "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
+            "swapped?). Declare sigma_translation_m of the cameras.",
+        )
+    ]
