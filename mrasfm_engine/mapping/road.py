@@ -41,6 +41,16 @@ class RoadAssessment:
         on: Bools = self.is_inlier & (np.abs(self.distance_m) <= self.limit_m)
         return on
 
+    def patches_of(self, points_m: Floats) -> Ints:
+        """Patches (n,) of the points where these lie now; -1 off the surface.
+
+        Adjustments after the road was found move points with it, by less than it is uneven, and a few of them away.
+        """
+        distance_m, patch = self.fitted.surface.locate(points_m)
+        stayed = (patch >= 0) & (np.abs(distance_m) <= self.limit_m + self.fitted.roughness_m)
+        result: Ints = np.where(self.is_on_surface & stayed, patch, -1)
+        return result
+
     @property
     def road(self) -> Road:
         """Road of the scene."""
@@ -121,7 +131,7 @@ def drop_off_road(
 def road_where_points_are(mapper: Mapper, road: RoadAssessment | str) -> RoadAssessment | str:
     """The road of the map, found anew where its points have moved from its surface by more than the road is uneven.
 
-    Where none is found, the one that was found stays.
+    Where none is found, the one that was found stays if any of its points still are on it.
     """
     if not isinstance(road, RoadAssessment):
         return road
@@ -130,7 +140,8 @@ def road_where_points_are(mapper: Mapper, road: RoadAssessment | str) -> RoadAss
     if not kept.any() or np.median(np.abs(distance_m - road.distance_m)[kept]) <= road.fitted.roughness_m:
         return road
     again = drop_off_road(mapper, for_map=True)
-    return again if isinstance(again, RoadAssessment) else road
+    stays = isinstance(again, str) and (road.patches_of(mapper.state.points_m[road.tracks]) >= 0).any()
+    return road if stays else again
 
 
 def _points_of_the_road(mapper: Mapper, world_from_rig: Floats, *, for_map: bool) -> tuple[RoadSource, Ints] | str:

@@ -56,8 +56,7 @@ def build_scene(
     georeferenced = refinement.georeferenced
     patches, judged = np.full(len(mapper.tracks), -1, dtype=np.int32), refinement.road
     if isinstance(judged, RoadAssessment):
-        on_surface = judged.is_on_surface
-        patches[judged.tracks[on_surface]] = judged.fitted.patch[on_surface]
+        patches[judged.tracks] = judged.patches_of(mapper.state.points_m[judged.tracks])
     return Scene(
         drive=mapper.drive,
         unit_registered=mapper.registered.copy(),

@@ -11,7 +11,13 @@ from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe, describe_refinement
 from mrasfm_engine.mapping.refinement import refine
-from mrasfm_engine.mapping.road import RoadAssessment, assess_road, drop_off_road, height_sigmas_m
+from mrasfm_engine.mapping.road import (
+    RoadAssessment,
+    assess_road,
+    drop_off_road,
+    height_sigmas_m,
+    road_where_points_are,
+)
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.semantics import ROAD, UNKNOWN
 from mrasfm_engine.triangulation.tracks import Keypoints
@@ -177,6 +183,33 @@ def test_cameras_that_do_not_see_the_road_change_nothing() -> None:
     assert said["source"] is None
     assert "below the vehicle's trajectory" in said["reason"]
     assert "switched off" in describe_refinement(off, switched_off)["road"]["reason"]
+
+
+def test_points_that_an_adjustment_moves_away_are_on_no_patch(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
+    simulated, _ = shadows
+    mapper = mapped(simulated)
+    judgement = drop_off_road(mapper, for_map=True)
+    assert isinstance(judgement, RoadAssessment)
+    points_m = mapper.state.points_m
+    on = judgement.tracks[judgement.patches_of(points_m[judgement.tracks]) >= 0]
+    assert len(on) > 100
+    np.testing.assert_array_equal(np.isin(judgement.tracks, on), judgement.is_on_surface)
+    points_m[on[:10], 0] += 500.0
+    points_m[on[10:20], 2] += 3.0
+    patches = judgement.patches_of(points_m[judgement.tracks])
+    np.testing.assert_array_equal(judgement.tracks[patches >= 0], on[20:])
+    assert road_where_points_are(mapper, judgement) is judgement
+
+
+def test_a_road_that_all_points_have_left_is_no_road(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
+    simulated, _ = shadows
+    mapper = mapped(simulated)
+    judgement = drop_off_road(mapper, for_map=True)
+    mapper.state.points_m[:, 2] += 3.0
+    mapper.triangulated[judgement.tracks if isinstance(judgement, RoadAssessment) else []] = False
+    found = road_where_points_are(mapper, judgement)
+    assert isinstance(found, str)
+    assert "too few" in found
 
 
 def test_bad_road_points_do_not_pull_the_poses(shadows: tuple[SimulatedDrive, np.ndarray]) -> None:
