@@ -259,17 +259,20 @@ def estimate_rig(
         correction = most_likely_correction(problem.errors, start, least_spread=problem.least_spread)
         demanded, posterior = _demanded(correction)
         refined = problem.turned(demanded)
-        if _stands(problem, refined, max_error_px):
+        # Cameras may be so near one another that the way between them is as uncertain as it is long.
+        is_turned = not np.array_equal(refined, rig_from_cam)
+        moved = problem.moved(refined, correction.x[len(demanded) :]) if is_turned else refined
+        if _stands(problem, refined, moved, max_error_px):
             break
     else:
-        refined, posterior = rig_from_cam, np.eye(3 * len(rig_from_cam))
+        refined, moved, posterior = rig_from_cam, rig_from_cam, np.eye(3 * len(rig_from_cam))
     spread = posterior * problem.sigma_rad[:, None]
     return RigEstimate(
         rig_from_cam=refined,
         covariance=_of_poses(spread @ spread.T, sigma_translation_m**2),
         matches=sum(len(one.rays_a) for one in problem.found),
         fitted_as_given=problem.share_that_fits(rig_from_cam, max_error_px),
-        fitted=problem.share_that_fits(refined, max_error_px),
+        fitted=problem.share_that_fits(moved, max_error_px),
         is_far=bool(problem.are_far(refined).any()),
     )
 
@@ -299,12 +302,15 @@ def _demanded(correction: Correction) -> tuple[Floats, Floats]:
     return directions[:, demanded] @ along[demanded], directions * posterior
 
 
-def _stands(problem: _RigProblem, refined: Floats, max_error_px: float) -> bool:
-    """Return whether refined poses (c, 4, 4) correct the given ones: more matches fit, and nowhere fewer."""
+def _stands(problem: _RigProblem, refined: Floats, moved: Floats, max_error_px: float) -> bool:
+    """Return whether refined poses (c, 4, 4) correct the given ones: more matches fit, and nowhere fewer.
+
+    Matches are judged with the places that they demand, `moved` (c, 4, 4).
+    """
     if not problem.found or np.array_equal(refined, problem.rig_from_cam):
         return True
     counts = np.array([len(one.rays_a) for one in problem.found])
-    before, after = (problem.shares_that_fit(rig, max_error_px) for rig in (problem.rig_from_cam, refined))
+    before, after = (problem.shares_that_fit(rig, max_error_px) for rig in (problem.rig_from_cam, moved))
     given, fitted = (counts @ shares / counts.sum() for shares in (before, after))
     if (after < before - np.maximum(GAIN, 1.0 / counts)).any():
         return False
@@ -351,11 +357,15 @@ class _RigProblem:
         turned = se3.exp_so3((x * self.sigma_rad).reshape(-1, 3)) @ self.rig_from_cam[:, :3, :3]
         return se3.transform(turned, self.rig_from_cam[:, :3, 3])
 
+    def moved(self, rig_from_cam: Floats, x: Floats) -> Floats:
+        """Poses (c, 4, 4) with the places corrected by x (3 c,)."""
+        moved_m = rig_from_cam[:, :3, 3] + (x * self.sigma_m).reshape(-1, 3)
+        return se3.transform(rig_from_cam[:, :3, :3], moved_m)
+
     def errors(self, x: Floats) -> list[Errors]:
         """Errors of each pair of cameras, with no more information than of `INDEPENDENT_MATCHES`."""
         turns, shifts = np.split(x, 2)
-        rig, result = self.turned(turns), []
-        rig[:, :3, 3] += (shifts * self.sigma_m).reshape(-1, 3)
+        rig, result = self.moved(self.turned(turns), shifts), []
         for one in self.found:
             a, b = one.camera_a, one.camera_b
             error, derivatives, _ = epipolar_derivatives(rig[a], rig[b], one.rays_a, one.rays_b)

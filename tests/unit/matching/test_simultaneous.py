@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -121,6 +122,33 @@ def test_matches_of_one_unit_that_all_agree_turn_no_camera_far(units: int, found
     assert rig.is_far == found
     if not found:
         np.testing.assert_array_equal(rig.rig_from_cam, given)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_cameras_whose_places_are_as_uncertain_as_they_are_apart_are_corrected(seed: int) -> None:
+    """Two stereo pairs, one in grey and one in colour, whose cameras stand beside one another."""
+    rng = np.random.default_rng(seed)
+    ahead = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+    true = se3.transform(np.tile(ahead, (4, 1, 1)), [[1.1, y, 0.7] for y in (-0.31, -0.85, -0.25, -0.79)])
+    given = se3.transform(
+        se3.exp_so3(rng.normal(0.0, 1.0, (4, 3)) * DEG) @ true[:, :3, :3],
+        true[:, :3, 3] + rng.normal(0.0, 0.04, (4, 3)),
+    )
+    points_m = rng.uniform([4.0, -3.0, -1.0], [12.0, 3.0, 3.0], (2000, 3))
+    rays = se3.apply(se3.inverse(true), points_m)
+    rays = rays / rays[..., 2:] + rng.normal(0.0, 0.3 / 700.0, rays.shape) * [1.0, 1.0, 0.0]
+    rig = estimate_rig(
+        given,
+        [SimultaneousMatches(camera_a=a, camera_b=b, rays_a=rays[a], rays_b=rays[b], units=9)
+         for a, b in combinations(range(4), 2)],
+        sigma_rotation_rad=np.full(4, 2.0 * DEG), sigma_translation_m=np.full(4, 0.05),
+        focal_px=np.full(4, 700.0), max_error_px=4.0,
+    )  # fmt: skip
+    assert rig.fitted_as_given < 0.5
+    assert rig.fitted > 0.95
+    np.testing.assert_array_equal(rig.rig_from_cam[:, :3, 3], given[:, :3, 3])
+    for a, b in combinations(range(4), 2):
+        assert relative_error_deg(rig.rig_from_cam, true, a, b) < 0.7
 
 
 def test_a_correction_under_which_few_matches_fit_is_none() -> None:
