@@ -28,6 +28,10 @@ not there.
 Small functions of the inner loops are `forceinline`: LLVM puts them into their callers. With `inline="always"` numba
 would copy their code before it infers types, and compile every copy anew, which takes several times as long. Constants
 among a kernel's arguments are wrapped (`np.bool_(False)`): a literal is a type of its own, and compiled for itself.
+
+Kernels unpack their named tuples once and call `linearise` themselves: a function between them, inlined or not, counts
+the references of its arrays again for every observation. Without row bands that makes `back_substitution.substitute`
+slower by 20 % and more.
 """
 
 from __future__ import annotations
@@ -85,6 +89,19 @@ class Observed(NamedTuple):
     xy: Floats
     first: Ints
     fixed: Bools
+
+
+class Slots(NamedTuple):
+    """Slots of units and cameras in the reduced vector, -1 where held; number of free units.
+
+    `inner` is as long as a camera has places besides its pose, for intrinsics and its time offset: a length that is
+    part of the type, so that loops over them are compiled for it.
+    """
+
+    unit: Ints
+    camera: Ints
+    num_units: int
+    inner: tuple[int, ...]
 
 
 class Loss(NamedTuple):
@@ -203,6 +220,41 @@ def linearise(
     if jc.shape[1] > 9:
         intrinsics_derivatives(kind, k, cam, proj, s, jc)
     return True
+
+
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def workspace(dof: int) -> Any:
+    """Arrays d, rig, cam, work, proj, res, jx and jc for `linearise`, of a camera with `dof` unknowns."""
+    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
+    return d, rig, cam, work, proj, res, np.empty((2, 3)), np.empty((2, dof))
+
+
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def row_band(bands: Any, n: int) -> int:
+    """Row band of an observation; 0 where there are none."""
+    return 0 if bands is None else bands.of_observation[n]
+
+
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def follows_trajectory(motion: Any, band: int) -> Any:
+    """True if steps of several units move a row band, False if it is held to its own."""
+    return np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
+
+
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def num_supports(motion: Any) -> int:
+    """Number of units whose steps may move an observation: its own, or the support of its row band."""
+    return 1 if motion is None else 3
+
+
+@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+def support(motion: Any, unit_slot: Any, u: int, band: int, k: int) -> tuple[int, float]:
+    """Slot, -1 where held, and weight of unit k of those whose steps move an observation by unit u."""
+    if motion is None:
+        return unit_slot[u], 1.0
+    # Read before the weight is known, of the last unit for a support of -1: a branch here is slower.
+    weight, slot = motion.weight[band, k], unit_slot[motion.support[band, k]]
+    return (-1 if weight == 0.0 else slot), weight
 
 
 @njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})

@@ -1,6 +1,6 @@
 """Points that move by themselves: what their observations cost, and one step of each where poses are held.
 
-In a step of Levenberg-Marquardt, points follow the poses by their derivatives (`elimination_kernels.substitute`). Where
+In a step of Levenberg-Marquardt, points follow the poses by their derivatives (`back_substitution.substitute`). Where
 that throws a few of little depth far away, the whole step would be refused for them; and where a robust weight changes,
 a point has further to go. Both cost iterations of the whole system. Here every point goes on towards its own minimum
 once the poses have moved, as in Ceres' inner iterations or in variable projection (Golub and Pereyra, 1973): an
@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.elimination_kernels import invert3
 from mrasfm_engine.bundle_adjustment.kernels import (
     BEHIND_PX,
     Bands,
@@ -24,6 +23,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     camera_point,
     linearise,
 )
+from mrasfm_engine.bundle_adjustment.point_elimination import invert3
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.jit import njit
 

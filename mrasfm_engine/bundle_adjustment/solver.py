@@ -12,16 +12,10 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from mrasfm_engine.bundle_adjustment.elimination_kernels import (
-    Slots,
-    Sums,
-    accumulate,
-    add_images,
-    add_scores,
-    image_sums,
-    substitute,
-)
-from mrasfm_engine.bundle_adjustment.kernels import Bands, Loss, Motion, Observed, Views, squared_errors
+from mrasfm_engine.bundle_adjustment.back_substitution import add_scores, substitute
+from mrasfm_engine.bundle_adjustment.image_sums import add_images, num_image_sums
+from mrasfm_engine.bundle_adjustment.kernels import Bands, Loss, Motion, Observed, Slots, Views, squared_errors
+from mrasfm_engine.bundle_adjustment.point_elimination import Sums, accumulate
 from mrasfm_engine.bundle_adjustment.point_refinement import point_costs, refine_points
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.problem import DISTORTION, UNIT_DOF, Layout, Observations, RowBandMotion, retract
@@ -221,7 +215,7 @@ class Problem:
         o, layout, options, structure = self.observations, self.layout, self.options, self.structure
         units, cameras, dof, p = layout.num_units, layout.num_cameras, layout.camera_dof, o.num_points
         parts = min(options.threads, max(1, p // 256))
-        images = np.zeros((parts, len(structure.image_unit), image_sums(dof - 6)))
+        images = np.zeros((parts, len(structure.image_unit), num_image_sums(dof - 6)))
         blocks = (
             np.zeros((parts, len(structure.pattern.row), UNIT_DOF * UNIT_DOF)),
             np.zeros((parts, cameras, units, dof * UNIT_DOF)),

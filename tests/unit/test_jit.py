@@ -62,7 +62,7 @@ def test_sources_are_those_of_kernels_and_constants() -> None:
 
     assert names(kernels.__name__) == {"kernels.py", "camera_model.py"}
     assert names(sampson.__name__) == {"sampson.py", "small_cholesky.py", "robust_correction.py"}
-    of_others = {"elimination_kernels.py", "kernels.py", "schur_structure.py", "camera_model.py"}
+    of_others = {"point_elimination.py", "image_sums.py", "kernels.py", "schur_structure.py", "camera_model.py"}
     assert names(point_refinement.__name__) == {"point_refinement.py", *of_others}, "also of those of others"
 
 
