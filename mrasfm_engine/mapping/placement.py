@@ -40,6 +40,7 @@ from mrasfm_engine.types import Floats, Ints
 
 KNOTS = 20  # in the correlation time of what wanders: less often than its filter lets a receiver change its mind
 SCALE_ROUNDS = 3  # of fitting an arbitrary scale to the receiver
+LONG_GAP = 3.0  # of a receiver's usual interval between samples
 FOLLOWING_ROUNDS = 2  # of placing the scene by positions that follow it between samples, as it was placed before
 # Sigma of the scale by images, relative, beyond which it does not bound their error, as the cost is no longer alike in
 # the scale and in its inverse. Of a stereo pair it is a percent or less.
@@ -145,15 +146,17 @@ def _positions_m(mapper: Mapper, gnss: GnssTrack, antenna_in_rig_m: Floats | Non
     """Positions at the times of all units, see `GnssTrack.at`.
 
     With the lever arm they follow the scene between samples, which then lies where the receiver says, and samples that
-    jump against it are left out.
+    jump against it are left out. In a gap that is long for the receiver there are none: they would say what its ends
+    say, as often as there are units, and by scattering about nothing look exact.
     """
     times_us, way_m = mapper.drive.timestamps_us, None
+    max_gap_us = min(mapper.config.gnss.max_time_gap_s * 1e6, LONG_GAP * gnss.interval_us)
     if antenna_in_rig_m is not None:
         units = np.flatnonzero(mapper.registered)
         gnss = without_wrong_samples(mapper, gnss, units, antenna_in_rig_m)
         way_m = np.full((len(times_us), 3), np.nan)
         way_m[units] = antenna_places_m(mapper, units, antenna_in_rig_m)
-    return _Known(*gnss.at(times_us, max_gap_us=round(mapper.config.gnss.max_time_gap_s * 1e6), way_m=way_m))
+    return _Known(*gnss.at(times_us, max_gap_us=round(max_gap_us), way_m=way_m))
 
 
 def _with_receivers_scale(

@@ -13,6 +13,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.io.axes import flu_from_body as flu_from_axes
 from mrasfm_engine.matching.prepared_images import Matcher
+from mrasfm_engine.matching.simultaneous import LARGEST_TURN_DEG
 from mrasfm_engine.matching.verification import (
     epipolar_errors,
     essential_inliers,
@@ -107,7 +108,7 @@ def require_calibration_direction(
 
 def _require_no_better(given_ok: float, others: Sequence[tuple[float, _Reading]]) -> None:
     """Refuse what was given where another reading agrees clearly better; of two that do, both are named."""
-    best = {kind: max(ok for ok, other in others if other is kind) for kind in _Reading}
+    best = {kind: max((ok for ok, other in others if other is kind), default=0.0) for kind in _Reading}
     better = sorted((kind for kind in best if best[kind] > CLEARLY_BETTER), key=lambda kind: -best[kind])
     if not better:
         return
@@ -150,7 +151,9 @@ def _readings(rig_from_cam: Floats) -> Iterator[tuple[_Reading, Floats]]:
         yield _Reading.INVERSE, flu_from_body @ se3.inverse(given)
         wxyz = se3.quaternion_from_rotation(given[..., :3, :3])
         meant = se3.rotation_from_quaternion(np.roll(wxyz, -1, axis=-1))
-        yield _Reading.QUATERNION_ORDER, flu_from_body @ se3.transform(meant, given[..., :3, 3])
+        # Where the order hardly matters, another one may fit better by chance, and the given one is off by as little.
+        if se3.rotation_angle_deg(np.swapaxes(given[..., :3, :3], -1, -2) @ meant).max() > LARGEST_TURN_DEG:
+            yield _Reading.QUATERNION_ORDER, flu_from_body @ se3.transform(meant, given[..., :3, 3])
 
 
 def share_explained(rig_from_a: Floats, rig_from_b: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> float:

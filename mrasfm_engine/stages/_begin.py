@@ -76,15 +76,43 @@ def held_findings(track: GnssTrack) -> list[Finding]:
 
 
 def probe(run: Run) -> None:
-    """Check on the first units that the calibration is the right way round; their features are those of the stage."""
-    images = [i for i, image in enumerate(run.drive.images) if image.unit < PROBE_UNITS]
+    """Check on the first units that the calibration is the right way round; their features are those of the stage.
+
+    What they say against it, units in the middle of the drive have to say as well: beside a vehicle that has just begun
+    to move, all that moves may be the others.
+    """
     known = run.store.has("features", run.next_key(Stage.FEATURES, run.feature_settings))
     if len(run.drive.cameras) < 2 or known:
         return
-    first = run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:PROBE_UNITS]})
-    beginning = Drive(run.drive.root, first)
+    try:
+        try:
+            _probe(run, 0)
+        except InputError:
+            middle = len(run.drive.manifest.frames) // 2
+            if middle < PROBE_UNITS:
+                raise
+            _probe(run, middle)
+    except InputError:
+        run.store.forget(PLAN_CHECKPOINTS)  # the drive with another calibration is another one
+        raise
+
+
+def _probe(run: Run, first_unit: int) -> None:
+    """Check the calibration's direction on some units, whose features are kept.
+
+    Raises
+    ------
+    InputError
+        See `require_calibration_direction`.
+    """
+    units = range(first_unit, min(first_unit + PROBE_UNITS, len(run.drive.manifest.frames)))
+    images = [i for i, image in enumerate(run.drive.images) if image.unit in units]
+    probed = Drive(
+        run.drive.root,
+        run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[units.start : units.stop]}),
+    )
     features = extract_features(
-        beginning,
+        probed,
         run.extractor,
         threads=run.config.threads,
         segmenter=run.components.segmenter,
@@ -93,13 +121,7 @@ def probe(run: Run) -> None:
         repeated=run.repeated,
         cancel=run.cancel,
     )
-    run.probed = {
-        image.file: found for image, found in zip(beginning.images, features, strict=True) if not found.left_out
-    }
-    if all(f.left_out for f in features):
-        return  # the extraction says whether there are others
-    try:
+    kept = {image.file: found for image, found in zip(probed.images, features, strict=True) if not found.left_out}
+    run.probed = {**run.probed, **kept}
+    if not all(f.left_out for f in features):  # else the extraction says whether there are others
         require_calibration_direction(run.drive, images, features, run.components.matcher, run.config.matching)
-    except InputError:
-        run.store.forget(PLAN_CHECKPOINTS)  # the drive with another calibration is another one
-        raise

@@ -58,7 +58,7 @@ class Run:
     report: dict[str, Any] = field(default_factory=new_report)
     own_cars: list[Bools | None] = field(default_factory=list)  # by camera, once images were looked at
     side_px: Mapping[Size, int] = field(default_factory=dict)  # that images of a size are reduced to, once it is known
-    probed: Mapping[str, ImageFeatures] = field(default_factory=dict)  # features of the first units' images, by file
+    probed: Mapping[str, ImageFeatures] = field(default_factory=dict)  # features of the probe's images, by file
     key: str = ""  # fingerprint of what has been done so far; where it is empty, the drive's counts
     standing: Standing | None = None  # where units are left out: which, and the drive with all of them
     whole_drive: Drive | None = None
