@@ -339,12 +339,15 @@ def motion_findings(mapper: Mapper) -> list[Finding]:
 def scale_findings(refinement: Refinement) -> list[Finding]:
     """Warn where lengths in the scene are hardly known."""
     certainty = refinement.certainty
-    if certainty is None or not np.isfinite(certainty.sigma_scale) or certainty.sigma_scale <= MAX_SIGMA_SCALE:
+    if certainty is None or certainty.sigma_scale <= MAX_SIGMA_SCALE:
         return []
+    known = "by how much lengths may be off is not known: something that they depend on is not determined"
+    if np.isfinite(certainty.sigma_scale):
+        known = f"lengths are known to {certainty.sigma_scale:.1%} (one sigma): the drive observes the scale badly"
     return [
         warning(
             "scale-uncertain",
-            f"lengths are known to {certainty.sigma_scale:.1%} (one sigma): the drive observes the scale badly",
+            known,
             "Give GNSS positions, or declare sigma_translation_m of cameras whose distances are known better; a longer "
             "drive with turns, and cameras with a common view, tell the scale as well.",
         )

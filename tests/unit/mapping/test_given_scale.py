@@ -139,3 +139,12 @@ def test_every_parameter_of_a_lens_moves_keypoints_by_as_much(model: str, more: 
             moved[place] += step
         off_px = np.linalg.norm(project_points(kind, moved, mapper.keypoints.rays) - seen, axis=1)
         assert np.sqrt((off_px**2).mean()) == pytest.approx(LENS_SIGMA_PX, rel=0.3), place
+
+
+def test_a_scale_of_which_no_sigma_is_known_is_said_to_be_uncertain() -> None:
+    simulated = make_simulated_drive(units=8, cameras=2, points=600)
+    result = refine(with_true_poses(make_model(simulated), simulated, range(8)))
+    assert result.certainty is not None
+    result.certainty = replace(result.certainty, sigma_scale=np.inf)
+    (said,) = scale_findings(result)
+    assert (said.code, "not known" in said.what) == ("scale-uncertain", True)

@@ -246,6 +246,20 @@ def test_between_the_samples_of_a_slow_receiver_positions_follow_the_scene(start
     assert placement.noise_factor < 2.0
 
 
+def test_a_gap_that_is_long_for_a_receiver_has_no_positions() -> None:
+    """They would say what its ends say, and look exact: a third of all positions that scatter about nothing."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    inside = (np.arange(UNITS) > 9) & (np.arange(UNITS) < 20)
+    with_gap = replace(received(simulated, 0.1), good=~inside)
+    placement = place_by_gnss(mapper, with_gap, ARM_M)
+    np.testing.assert_array_equal(placement.units, np.flatnonzero(~inside))
+    errors = most_likely_errors(mapper, placement)
+    assert 0.7 < errors.white < 1.4
+    short = replace(received(simulated, 0.1), good=~inside | (np.arange(UNITS) % 3 == 0))
+    np.testing.assert_array_equal(place_by_gnss(mapper, short, ARM_M).units, np.arange(UNITS))
+
+
 def test_errors_of_which_no_scatter_is_seen_scatter() -> None:
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=600)
     mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
