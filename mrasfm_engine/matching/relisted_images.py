@@ -196,4 +196,11 @@ def _common_rotation(rays_a: Sequence[Floats], rays_b: Sequence[Floats], max_err
     good = essential_inliers(a, b, max_error=max_error)
     # The matches of each unit have a matrix that they agree with; one of all shows that the cameras are fixed.
     pose = relative_pose(a[good], b[good], max_error=max_error) if good.mean() >= CLEARLY_BETTER else None
-    return None if pose is None else pose[0]
+    if pose is None:
+        return None
+    # Of cameras close to one another, noise decides whether points are before both: the other rotation of the essential
+    # matrix, half a turn about the baseline away, may win. Rays of one point differ by its parallax alone.
+    rotation, baseline = pose
+    twisted = (2.0 * np.outer(baseline, baseline) - np.eye(3)) @ rotation
+    along = [float(np.median((a[good] @ one.T * b[good]).sum(1))) for one in (rotation, twisted)]
+    return rotation if along[0] >= along[1] else twisted

@@ -223,6 +223,17 @@ def test_a_camera_that_is_turned_far_from_where_it_is_given_is_refused_with_the_
     assert f"turned by {turn_deg:.0f} deg" in caught.value.what
 
 
+@pytest.mark.parametrize("apart_m", [0.06, 0.005])
+@pytest.mark.parametrize("off_m", [0.0, 0.06])
+def test_cameras_close_to_one_another_are_not_turned_by_half_a_turn(apart_m: float, off_m: float) -> None:
+    """Their essential matrix hardly tells on which side of the cameras points are."""
+    true = se3.transform(np.tile(FORWARD, (2, 1, 1)), [[1.7, 0.3, 1.5], [1.7, 0.3 + apart_m, 1.5]])
+    given = turned(1, (1, 0, 0), 2.0)
+    given[:, :3, 3] = true[:, :3, 3]
+    given[1, 2, 3] += off_m
+    street(true=true, given=given, noise_px=0.6).check()
+
+
 def test_cameras_that_look_apart_pass() -> None:
     street(true=turned(1, (0, 1, 0), 180.0)).check()
     street(true=turned(1, (0, 1, 0), 90.0)).check()
