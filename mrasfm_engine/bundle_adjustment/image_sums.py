@@ -16,7 +16,15 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.kernels import Bands, Motion, Slots, Views, num_supports, support
+from mrasfm_engine.bundle_adjustment.kernels import (
+    Bands,
+    Motion,
+    Slots,
+    Views,
+    follows_trajectory,
+    num_supports,
+    support,
+)
 from mrasfm_engine.jit import njit
 
 UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient
@@ -193,7 +201,7 @@ def _camera_from_unit(
                 r[i, j] = unit_r[i, j]
                 q[i] += unit_r[i, j] * cam_t[j]
     else:
-        follows = np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
+        follows = follows_trajectory(motion, band)
         for i in range(3):
             q[i] = 0.0
             for j in range(3):

@@ -24,7 +24,7 @@ from mrasfm_engine.mapping.georeferencing import (
     similarity_motions,
 )
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.receiver_findings import SCALE_DISAGREEMENT_SIGMAS, clock_findings, scale_findings
+from mrasfm_engine.mapping.receiver_findings import SCALE_DISAGREEMENT_SIGMAS, clock_findings, rig_scale_findings
 from mrasfm_engine.mapping.receiver_fit import (
     MIN_POSITIONS,
     Placement,
@@ -116,7 +116,7 @@ def place_by_gnss(
     placement = with_prior(mapper, placement, thorough=thorough)
     if not single:
         placement = replace(placement, scale_of_rig=_scale_by_positions(mapper, placement))
-        placement.findings = clock_findings(mapper, placement) + scale_findings(mapper, placement)
+        placement.findings = clock_findings(mapper, placement) + rig_scale_findings(mapper, placement)
     return placement
 
 

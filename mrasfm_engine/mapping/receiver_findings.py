@@ -83,7 +83,7 @@ def clock_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
     ]
 
 
-def scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
+def rig_scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
     """The finding that the receiver contradicts the rig's scale."""
     positions = placement.prior
     assert positions is not None
