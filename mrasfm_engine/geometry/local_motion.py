@@ -11,6 +11,9 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_GAP_S = 2.5  # a pose farther away in time says nothing of how the vehicle moves now
 MIN_GAP_S = 0.02  # poses closer in time than this would turn their noise into speed
+# Of the interval to a neighbour. A camera whose clock is an interval late takes its images beyond the neighbours; there
+# a parabola still holds, to 5 mm at 5 m/s^3 of jerk and 0.1 s between units.
+REACH = 2.0
 # Of vehicles on roads. A neighbour whose pose is wrong would ask for more.
 MAX_ACCELERATION_MPS2 = 12.0
 MAX_TURN_ACCELERATION_RADPS2 = 3.0
@@ -30,7 +33,7 @@ class LocalMotion:
     velocity: Floats  # (u, 6) rotation (rad/s), translation (m/s)
     bend: Floats  # (u, 6) half an acceleration, 1/s^2
     earliest_s: Floats  # (u,) as far back, and
-    latest_s: Floats  # (u,) as far forward, as anything is known: beyond, the vehicle is taken to stand
+    latest_s: Floats  # (u,) as far forward, as the motion reaches: beyond, the vehicle is taken to stand
     support: Ints  # (u, 3) the units that determine the motion: itself, and one or two others; -1 where there is none
     support_s: Floats  # (u, 2) times of the others, from the unit's own on
 
@@ -114,8 +117,8 @@ def local_motion(world_from_rig: Floats, time_s: Floats, known: Bools) -> LocalM
     return LocalMotion(
         velocity=velocity,
         bend=bend,
-        earliest_s=-reach,
-        latest_s=np.where(middle, gaps[1], reach),
+        earliest_s=-REACH * reach,
+        latest_s=REACH * np.where(middle, gaps[1], reach),
         support=support,
         support_s=np.stack(gaps, axis=1),
     )

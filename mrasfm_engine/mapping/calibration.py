@@ -149,21 +149,27 @@ def scale_scene(mapper: Mapper, factor: float) -> None:
     state.unit_position_m[:] = unit_position_m
 
 
-def hold_baselines(mapper: Mapper, certainty: Covariances) -> float:
-    """Give the baselines the length that they have by their prior; by how much the scene stays behind, in pixels.
+def hold_baselines(mapper: Mapper, certainty: Covariances, *, most_behind_px: float) -> None:
+    """Give the baselines the length that they have by their prior, unless the scene stays behind by more than that.
 
     The scene follows as far as it is known by them alone: all of it where images compare both well, as those of a
     stereo pair do, and none of it where positions know the scene's scale better than images compare it with the rig
-    [conditional mean of a normal distribution].
+    [conditional mean of a normal distribution]. A scene that stays behind contradicts its images, unless each camera
+    changes as the images want it: its length is then left to the adjustment, in which all of this weighs.
     """
     factor, follows = scale_of_baselines(mapper)[0], _share_of_baselines(mapper, certainty)[0]
     back = factor ** (follows - 1.0)
-    scale_with_baselines(mapper, factor)
-    scale_scene(mapper, back)
-    from_mean_m = np.linalg.norm(_about_their_mean(mapper.state.camera_position_m), axis=1)
-    away_m = abs(back - 1.0) * float(from_mean_m.max())
+    if _moves_images_px(mapper, factor * back, factor) <= most_behind_px:
+        scale_with_baselines(mapper, factor)
+        scale_scene(mapper, back)
+
+
+def _moves_images_px(mapper: Mapper, scene: float, baselines: float) -> float:
+    """How far points move in images, about, where the scene and the baselines are scaled by these factors."""
+    from_mean_m = baselines * np.linalg.norm(_about_their_mean(mapper.state.camera_position_m), axis=1)
+    away_m = abs(scene / baselines - 1.0) * float(from_mean_m.max())
     focal_px = float(mapper.state.camera_params[:, :2].mean())
-    return float(away_m * focal_px / max(median_depth_m(mapper), 1e-9))
+    return float(away_m * focal_px / max(scene * median_depth_m(mapper), 1e-9))
 
 
 def sigma_scale_of_images(mapper: Mapper, certainty: Covariances) -> float:

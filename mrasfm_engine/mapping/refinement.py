@@ -52,6 +52,7 @@ from mrasfm_engine.mapping.road import drop_off_road, road_where_points_are
 from mrasfm_engine.mapping.time_offsets import (
     assess_times,
     interpolation_error_s,
+    offsets_are_steady,
     positions_may_tell_time,
     positions_tell_time,
     time_findings,
@@ -62,10 +63,10 @@ from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
-MAX_ROUNDS = 6  # and while the weights of positions change
+MAX_ROUNDS = 6  # and while the weights of positions or time offsets change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
-BEHIND = 0.1  # of an observation's sigma, beyond which a scene that stayed behind its baselines is adjusted
+BEHIND = 0.1  # of an observation's sigma, that a scene may stay behind baselines that are held
 
 
 def refine(
@@ -162,15 +163,16 @@ def _decide_what_varies(
 def _adjust_in_rounds(
     mapper: Mapper, result: Refinement, free_units: Bools, progress: CountProgress | None, cancel: Cancel | None
 ) -> None:
-    """Adjust, triangulate anew and filter, until the weights of positions are steady."""
+    """Adjust, triangulate anew and filter, until the weights of positions and the cameras' time offsets are steady."""
     _rescale(mapper, result, terms_of(mapper, result))
     steady = _unbend(mapper, result, free_units, cancel)
     done, is_last = 0, False
     while not is_last:
         result.sigma_px = observation_sigma_px(mapper)
         is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
+        offset_s = mapper.state.camera_time_offset_s
         _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
-        steady = _reassess(mapper, result)
+        steady = _reassess(mapper, result) and offsets_are_steady(mapper, offset_s)
         _choose_observations(mapper, result, is_last=is_last)
         if mapper.registered.sum() < 2:
             raise ReconstructionError(
@@ -211,7 +213,8 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
     if result.times_vary and result.certainty is not None:
         result.mean_time_varies &= positions_tell_time(mapper, result.certainty)
         prior = time_prior(mapper, mean_varies=result.mean_time_varies)
-        result.times = assess_times(prior, result.certainty, interpolation_error_s(mapper))
+        offset_s = mapper.state.camera_time_offset_s
+        result.times = assess_times(prior, result.certainty, interpolation_error_s(mapper), offset_s)
     if not result.recalibrated.any() or result.directions is None:
         return
     _hold_unobserved(
@@ -363,15 +366,11 @@ def _hold_unobserved(
     if result.times is not None:
         result.held_times = result.times.to_hold
     hold_times = result.held_times is not None and (result.held_times.any() or holds_mean_time)
-    hold_scale = result.georeferenced and weighed.scale_only_prior
-    behind_px = hold_baselines(mapper, result.certainty) if hold_scale else 0.0
     if weighed.to_hold[result.recalibrated].any() or hold_times:
         result.held = weighed.to_hold
         _adjust(mapper, result, free_units, rough=False, cancel=cancel)
-        behind_px = hold_baselines(mapper, result.certainty) if hold_scale else 0.0
-    if behind_px > BEHIND * result.sigma_px:  # units and points are no longer where the images want them
-        terms, options = result.absolute.terms(mapper), solver_options(mapper, result.sigma_px)
-        result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
+    if result.georeferenced and weighed.scale_only_prior:
+        hold_baselines(mapper, result.certainty, most_behind_px=BEHIND * result.sigma_px)
 
 
 def _rescale(mapper: Mapper, result: Refinement, terms: Sequence[Term]) -> None:

@@ -41,7 +41,7 @@ class TimeCertainty:
     sigma_s
         (cameras,) posterior.
     observed
-        (cameras,) whether the drive knows them better than their prior does.
+        (cameras,) whether the drive knows them better than their prior does, or has drawn them far from there.
     to_hold
         (cameras,) whether the adjustment knows nothing that the prior does not.
     """
@@ -79,6 +79,15 @@ def time_prior(mapper: Mapper, *, mean_varies: bool, held: Bools | None = None) 
     return TimePrior(
         sigma_s=sigma_s, held=np.zeros(len(sigma_s), dtype=np.bool_) if held is None else held, gauge_weights=weights
     )
+
+
+def offsets_are_steady(mapper: Mapper, before_s: Floats) -> bool:
+    """True where no offset (c,) has moved among the others by more than its prior allows.
+
+    One that moves farther is on its way: observations were chosen by what it was.
+    """
+    moved_s = mapper.state.camera_time_offset_s - before_s
+    return bool((np.abs(moved_s - np.median(moved_s)) <= BEYOND_PRIOR_SIGMAS * _sigma_s(mapper)).all())
 
 
 def _sigma_s(mapper: Mapper) -> Floats:
@@ -128,8 +137,10 @@ def interpolation_error_s(mapper: Mapper) -> Floats:
     return result
 
 
-def assess_times(prior: TimePrior, certainty: Covariances, error_s: Floats) -> TimeCertainty | None:
-    """Compare what is known of the offsets, besides errors (c,) that interpolation makes, with their prior.
+def assess_times(prior: TimePrior, certainty: Covariances, error_s: Floats, offset_s: Floats) -> TimeCertainty | None:
+    """Compare what is known of the offsets (c,), besides errors (c,) that interpolation makes, with their prior.
+
+    An offset that is far off by both is one that the drive wants, however little more than the prior it knows of it.
 
     None where nothing is known.
     """
@@ -143,10 +154,12 @@ def assess_times(prior: TimePrior, certainty: Covariances, error_s: Floats) -> T
     before_s = sigma_s(np.diag(prior.sigma_s**2))
     # What errors of all cameras do to the trajectory is common to them.
     after_s = sigma_s(certainty.times_s2 + np.outer(error_s, error_s) + (error_s**2).mean())
+    independent_s = sigma_s(certainty.times_of_independent_errors_s2)
+    is_far = np.abs(offset_s) > BEYOND_PRIOR_SIGMAS * np.maximum(prior.sigma_s, after_s)
     return TimeCertainty(
         sigma_s=after_s,
-        observed=np.asarray(after_s < OBSERVED_RATIO * before_s),
-        to_hold=np.asarray(sigma_s(certainty.times_of_independent_errors_s2) > ONLY_PRIOR_RATIO * before_s),
+        observed=np.asarray((after_s < OBSERVED_RATIO * before_s) | is_far),
+        to_hold=np.asarray((independent_s > ONLY_PRIOR_RATIO * before_s) & ~is_far),
     )
 
 

@@ -7,6 +7,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.local_motion import (
     MAX_ACCELERATION_MPS2,
     MAX_GAP_S,
+    REACH,
     local_motion,
     smoothed_velocity,
     third_differences,
@@ -97,11 +98,27 @@ def test_a_gap_is_bridged_and_a_far_one_is_not() -> None:
     np.testing.assert_array_equal(motion.at(np.array([1, 5]), np.array([0.05, 0.05])), np.tile(np.eye(4), (2, 1, 1)))
 
 
-def test_nothing_is_said_of_times_beyond_the_neighbours() -> None:
+def test_a_parabola_goes_on_beyond_the_neighbours() -> None:
+    """Else a camera that is late by more than an interval would not say so."""
+    time_s = np.arange(4) * 0.1
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 0, 3] = 5.0 * time_s + 0.5 * 3.0 * time_s**2
+    motion = local_motion(poses, time_s, all_known(time_s))
+    unit, offset_s = np.array([1, 2]), np.array([0.19, -0.19])
+    np.testing.assert_allclose(
+        poses[unit, 0, 3] + motion.at(unit, offset_s)[:, 0, 3],
+        5.0 * (time_s[unit] + offset_s) + 1.5 * (time_s[unit] + offset_s) ** 2,
+    )
+    np.testing.assert_allclose(motion.velocity_at(unit, offset_s)[:, 3], 5.0 + 3.0 * (time_s[unit] + offset_s))
+
+
+def test_nothing_is_said_of_times_far_beyond_the_neighbours() -> None:
     time_s = np.array([0.0, 0.1, 0.2])
     motion = local_motion(driven(time_s), time_s, all_known(time_s))
-    far = motion.at(np.array([1, 1]), np.array([5.0, -5.0]))
-    np.testing.assert_allclose(far, se3.exp_se3(np.array([[0.1], [-0.1]]) * TWIST), atol=1e-9)
+    far_s = 0.1 * REACH
+    unit = np.array([1, 1])
+    np.testing.assert_array_equal(motion.at(unit, np.array([5.0, -5.0])), motion.at(unit, np.array([far_s, -far_s])))
+    assert not motion.velocity_at(unit, np.array([5.0, -5.0])).any()
 
 
 def test_poses_at_almost_the_same_time_do_not_turn_noise_into_speed() -> None:

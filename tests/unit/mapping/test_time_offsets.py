@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
-from mrasfm_engine.mapping.time_offsets import time_prior, times_may_vary
+from mrasfm_engine.mapping.time_offsets import assess_times, time_prior, times_may_vary
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -31,7 +32,12 @@ TRAVELLED_M = 1.1 * np.arange(UNITS) - 2.5 * np.sin(2 * np.pi * np.arange(UNITS)
 
 
 def model(
-    late_ms: list[int], config: EngineConfig | None = None, *, apart: bool = True, **camera: Any
+    late_ms: list[int],
+    config: EngineConfig | None = None,
+    *,
+    apart: bool = True,
+    taken_ms: list[int] | None = None,
+    **camera: Any,
 ) -> tuple[Mapper, SimulatedDrive]:
     """A drive at its true poses, whose cameras take images so much later than their timestamps."""
     simulated = make_simulated_drive(
@@ -39,7 +45,7 @@ def model(
         cameras=4,
         points=2500,
         travelled_m=TRAVELLED_M,
-        time_offset_ms=APART_MS if apart else late_ms,
+        time_offset_ms=taken_ms or (APART_MS if apart else late_ms),
         late_ms=late_ms,
     )
     rig = simulated.drive.manifest.rig
@@ -117,6 +123,24 @@ def test_leaving_the_prior_is_a_finding() -> None:
     assert said.code == "time-offset-beyond-prior"
     assert simulated.drive.cameras[2].name in said.what
     assert "sigma_time_offset_us" in said.remedy
+
+
+def test_a_camera_that_is_late_by_more_than_an_interval_is_found_and_said_to_be() -> None:
+    """Its images stand beyond the units before and after, far from where its prior has them."""
+    mapper, simulated = model([0, 0, -60, 0], taken_ms=[0, 30, -130, 40], sigma_time_offset_us=2000.0)
+    result = refined(mapper, simulated, 0.02)
+    assert [said.code for said in result.late_cameras] == ["time-offset-beyond-prior"]
+    assert mapper.state.camera_time_offset_s[2] == pytest.approx(-0.06, abs=0.003)
+    assert rmse(metric_errors_m(mapper, simulated)) < 0.03
+
+    assert result.certainty is not None
+    of_prior = np.diag(np.full(4, 0.0019) ** 2)
+    nothing_known = replace(result.certainty, times_s2=of_prior, times_of_independent_errors_s2=of_prior)
+    prior = time_prior(mapper, mean_varies=True)
+    found = assess_times(prior, nothing_known, np.zeros(4), np.array([0.0, 0.001, -0.1, 0.0]))
+    assert found is not None
+    assert found.observed.tolist() == [False, False, True, False]
+    assert found.to_hold.tolist() == [True, True, False, True]
 
 
 def test_cameras_that_are_simultaneous_have_no_offset_unless_the_manifest_says_so() -> None:
