@@ -30,6 +30,7 @@ MIN_INLIERS = 50
 MIN_PARALLAX_RAD = np.radians(0.3)  # about 3 px at a focal length of 600 px
 MOTION_ERROR = 2e-3  # of a match between two units, in the plane z = 1
 PAIR_ERROR_PX = 4.0  # from the epipolar line of a calibration that is the right way round
+AGREE_DEG = 10.0  # between two cameras' directions of motion, of a small parallax and a calibration of some degrees
 CLEARLY_BETTER, CLEARLY_WORSE = 0.9, 0.75  # agreement of another reading, and of what was given, for a verdict
 MIN_EVIDENCE = 2  # unit pairs, or image pairs, that must say so
 
@@ -54,7 +55,7 @@ def require_calibration_direction(
 ) -> None:
     """Refuse a rig whose inverse, or whose quaternions in another order, explain the images clearly better.
 
-    Two signs are looked for. All cameras must find the car moving in one direction of the rig; under the inverse of
+    Two signs are looked for. Most cameras must find the car moving in one direction of the rig; under the inverse of
     differently turned cameras they don't. And matches between cameras of one unit must lie near their epipolar lines
     and in front of both cameras; with the baseline reversed they don't. The numbers may have been written in any axes
     that a manifest can have, before they became the engine's.
@@ -128,7 +129,7 @@ def _motion_agreement(
     where: dict[tuple[int, int], int],
     verified: Callable[[int, int], tuple[Floats, Floats] | None],
 ) -> list[float] | None:
-    """Length (0..1) of the mean of the cameras' directions of motion in every hypothesis of the rig."""
+    """How well the cameras' directions of motion agree (0..1) in every hypothesis of the rig."""
     directions = []
     for camera in range(len(rigs[0])):
         if (unit, camera) not in where or (unit + 1, camera) not in where:
@@ -141,7 +142,18 @@ def _motion_agreement(
             directions.append([rig[camera, :3, :3] @ direction for rig in rigs])
     if len(directions) < 2:
         return None
-    return [float(length) for length in np.linalg.norm(np.array(directions).mean(0), axis=1)]
+    return [_agreement(of_rig) for of_rig in np.swapaxes(np.array(directions), 0, 1)]
+
+
+def _agreement(directions: Floats) -> float:
+    """Share of unit vectors (n, 3) that agree with one of them, less what they differ by: 0 to 1.
+
+    A vehicle that overtakes fills one camera's image and turns its direction around. The mean of all would be shorter
+    under the right rig, where the others agree to a degree, than under one that scatters all of them.
+    """
+    near = directions @ directions.T > np.cos(np.radians(AGREE_DEG))
+    most = near[int(near.sum(axis=1).argmax())]
+    return float(np.linalg.norm(directions[most].sum(axis=0)) / len(directions))
 
 
 def _readings(rig_from_cam: Floats) -> Iterator[tuple[_Reading, Floats]]:

@@ -76,17 +76,30 @@ def test_quaternions_in_another_order_are_refused_as_that(cameras: int, axes: Bo
     assert "Give rotation_xyzw in the order x, y, z, w." in caught.value.remedy
 
 
-def rectified_stereo(rig_from_cam_given: np.ndarray) -> SimulatedDrive:
-    """Features of the rectified pair under any calibration in the manifest."""
+def seen_by(
+    rig_from_cam: np.ndarray,
+    rig_from_cam_given: np.ndarray,
+    *,
+    low_m: tuple[float, float],
+    backwards: int | None = None,
+) -> SimulatedDrive:
+    """Features of a rig under any calibration in the manifest, of points from x and y of `low_m` to 45 m and 12 m.
+
+    The camera `backwards` sees the world as if the vehicle drove backwards.
+    """
     rng = np.random.default_rng(0)
-    params = np.array([[700.0, 700.0, 480.0, 270.0]] * 2)
+    params = np.array([[700.0, 700.0, 480.0, 270.0]] * len(rig_from_cam))
     drive = make_drive(rig_from_cam_given, params, units=UNITS)
-    points = np.stack([rng.uniform(8, 45, 900), rng.uniform(-12, 12, 900), rng.uniform(-1, 8, 900)], 1)
-    descriptors, features = random_descriptors(900, rng), []
+    count = 900 if low_m[0] > 0 else 4000
+    points = np.stack(
+        [rng.uniform(low_m[0], 45, count), rng.uniform(low_m[1], -low_m[1], count), rng.uniform(-1, 8, count)], 1
+    )
+    descriptors, features = random_descriptors(count, rng), []
     for image in drive.images:
-        vehicle = se3.transform(np.eye(3), [1.1 * image.unit, 0.0, 0.0])
-        in_camera = se3.apply(se3.inverse(vehicle @ RECTIFIED[image.camera]), points)
-        xy = 700.0 * in_camera[:, :2] / in_camera[:, 2:] + [480.0, 270.0] + rng.normal(size=(900, 2)) * 0.3
+        unit = UNITS - 1 - image.unit if image.camera == backwards else image.unit
+        vehicle = se3.transform(np.eye(3), [1.1 * unit, 0.0, 0.0])
+        in_camera = se3.apply(se3.inverse(vehicle @ rig_from_cam[image.camera]), points)
+        xy = 700.0 * in_camera[:, :2] / in_camera[:, 2:] + [480.0, 270.0] + rng.normal(size=(count, 2)) * 0.3
         seen = (in_camera[:, 2] > 1) & (xy > 0).all(1) & (xy < [960, 540]).all(1)
         features.append(
             ImageFeatures(
@@ -97,6 +110,25 @@ def rectified_stereo(rig_from_cam_given: np.ndarray) -> SimulatedDrive:
         )
     truth = make_simulated_drive(units=1, cameras=1, points=50).truth  # not looked at
     return SimulatedDrive(truth=truth, drive=drive, features=features, point_of_keypoint=[])
+
+
+def rectified_stereo(rig_from_cam_given: np.ndarray) -> SimulatedDrive:
+    """Features of the rectified pair under any calibration in the manifest."""
+    return seen_by(RECTIFIED, rig_from_cam_given, low_m=(8.0, -12.0))
+
+
+def looking(yaw_deg: float) -> np.ndarray:
+    """Pose of a camera at the rim of a roof that looks into a direction."""
+    turn = se3.exp_so3(np.array([0.0, 0.0, np.radians(yaw_deg)]))
+    return se3.transform(turn @ RECTIFIED[0, :3, :3], turn @ [1.0, 0.0, 0.0] + [0.0, 0.0, 1.5])
+
+
+def test_a_vehicle_that_overtakes_is_no_reason_to_refuse() -> None:
+    """The camera that it fills says the opposite of the others, which agree; other orders scatter all of them."""
+    rig_from_cam = np.stack([looking(yaw_deg) for yaw_deg in (-60.0, 60.0, 90.0)])
+    check(seen_by(rig_from_cam, rig_from_cam, low_m=(-45.0, -45.0), backwards=0))
+    with pytest.raises(InputError, match="If it is not that: Give rotation_xyzw in the order"):
+        check(seen_by(rig_from_cam, reordered(rig_from_cam), low_m=(-45.0, -45.0)))
 
 
 def test_a_rectified_stereo_pair_passes_and_its_inverse_does_not() -> None:
