@@ -9,8 +9,8 @@ from heapq import heapify, heappop, heappush
 import numpy as np
 
 from mrasfm_engine.aggregation.association import component_labels
-from mrasfm_engine.aggregation.loops import Loop, LoopConsistency, ScenePaths, seam_covariance
-from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.loops import Loop, LoopConsistency, ScenePaths
+from mrasfm_engine.aggregation.seam import Seam, with_bends
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.pose_graph import Edges, optimise_pose_graph
 from mrasfm_engine.types import Floats
@@ -151,7 +151,7 @@ class SeamGraph:
         return -min(quality["units_a"], quality["units_b"]), -quality["inliers"]
 
     def _sigmas(self, seam: Seam) -> tuple[float, float]:
-        covariance = seam_covariance(seam)
+        covariance = with_bends(seam.covariance)
         rotation, translation = (float(np.sqrt(np.trace(covariance[i : i + 3, i : i + 3]) / 3)) for i in (0, 3))
         return rotation, translation
 

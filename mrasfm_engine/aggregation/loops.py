@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import chdtrc, chdtri  # scipy.stats takes half a second to import
 
-from mrasfm_engine.aggregation.seam import Seam
+from mrasfm_engine.aggregation.seam import Seam, with_bends
 from mrasfm_engine.aggregation.significance import in_sigmas
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.geometry import se3
@@ -38,7 +38,6 @@ DRIFT_RAD_PER_SQRT_M = np.radians(0.02) / np.sqrt(10.0)
 MIN_LOOPS, USUAL_MISCLOSURE = 10, float(chdtri(6, 0.5))
 UNKNOWN_SCALE_SHARE = 1.0 / 3.0  # of the largest difference between scenes that seams allow: a gate is several sigmas
 STRAIGHT_PARTS = 32  # of a path of which only the ends are known
-LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # of a seam: it averages over the bends of both scenes there
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -315,7 +314,7 @@ class LoopConsistency:
                 here.append(_error_at(pose, leave_m, self._paths[scene].covariance(arrived_m, leave_m)))
             a, b = self._ends[k]
             here.append(_error_at(pose if scene == a else pose @ se3.inverse(self._seams[k].a_from_b),
-                                  self._place(k, a), seam_covariance(self._seams[k])))  # fmt: skip
+                                  self._place(k, a), with_bends(self._seams[k].covariance)))  # fmt: skip
             pose = pose @ (self._seams[k].a_from_b if scene == a else se3.inverse(self._seams[k].a_from_b))
             scenes.append(b if scene == a else a)
             arrived_m = self._place(k, scenes[-1])
@@ -334,12 +333,6 @@ class LoopConsistency:
         at = seam.place_b_m[None]
         result: Floats = (se3.apply(seam.a_from_b, at) if scene == self._ends[k][0] else at)[0]
         return result
-
-
-def seam_covariance(seam: Seam) -> Floats:
-    """The covariance (6, 6) of a seam about its place, in a's axes."""
-    result: Floats = seam.covariance + np.diag([LEAST_SIGMA_RAD**2] * 3 + [LEAST_SIGMA_M**2] * 3)
-    return result
 
 
 def _error_at(first_from_scene: Floats, at_m: Floats, covariance: Floats) -> tuple[Floats, Floats]:
@@ -370,6 +363,6 @@ def off_positions(seam: Seam, sigma_a_m: Floats, sigma_b_m: Floats) -> float:
     # What units of a scene err by they share, as receivers do: its mean square, not its mean's.
     of_a, of_b = (np.diag((rows**2).mean(0)) for rows in known)
     a_from_b = seam.a_from_b[:3, :3]
-    covariance = of_a + a_from_b @ of_b @ a_from_b.T + seam_covariance(seam)[3:, 3:]
+    covariance = of_a + a_from_b @ of_b @ a_from_b.T + with_bends(seam.covariance)[3:, 3:]
     squared = float(shift_m @ np.linalg.solve(covariance, shift_m))
     return in_sigmas(squared, 3)

@@ -33,6 +33,7 @@ BATCH_UNITS = 4  # relocalised between two tests of their agreement
 ENOUGH_AGREEING = 4  # units, after which no more are looked for
 ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
 MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus
+LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # it averages over the bends of both scenes there
 MIN_POINTS_OF_UNIT = 5  # shared points that a unit sees, for it to be part of the seam
 
 
@@ -46,7 +47,7 @@ class Seam:
     reason: str
     coarse_a_from_b: Floats  # (4, 4) by positions; where a scene has none, by the units that were relocalised first
     a_from_b: Floats  # (4, 4); the coarse one where nothing better is known, NaN where nothing is
-    covariance: Floats  # (6, 6) of [omega, v] about the middle of b's units at the seam, in a's axes
+    covariance: Floats  # (6, 6) of [omega, v] about the middle of b's units at the seam, in a's axes, without bends
     shared: Ints  # (n, 2) points of a and of b that are one
     units_a: Ints  # that see shared points
     units_b: Ints
@@ -190,6 +191,8 @@ def _judged(
     scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
     at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
     covariance = _about(refined.covariance, b, refined.a_from_b, at)
+    covariance[3:, 3:] += _error_by_lengths(a, refined, at, scale, sigma_scale)
+    stated = with_bends(covariance)
     shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
     turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ coarse[:3, :3].T))
     before = _residual_px(assembly, coarse, refined.shared)
@@ -200,8 +203,8 @@ def _judged(
         "observations": len(refined.errors_px),
         "residual_before_px": before,
         "residual_after_px": float(np.median(refined.errors_px)),
-        "sigma_translation_m": float(np.sqrt(np.trace(covariance[3:, 3:]))),
-        "sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(covariance[:3, :3])))),
+        "sigma_translation_m": float(np.sqrt(np.trace(stated[3:, 3:]))),
+        "sigma_rotation_deg": float(np.degrees(np.sqrt(np.trace(stated[:3, :3])))),
         "scale": scale,
         "sigma_scale": sigma_scale,
     }
@@ -278,6 +281,25 @@ def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -
     change = np.eye(6)
     change[3:, :3] = -se3.skew(arm)
     result: Floats = change @ covariance @ change.T
+    return result
+
+
+def _error_by_lengths(a: SourceScene, refined: RefinedSeam, at_b: Floats, scale: float, sigma_scale: float) -> Floats:
+    """Covariance (3, 3) of the shift at a place of b that the scenes' different lengths make.
+
+    A rigid transform lays shared points on one another. From there to b's units it is as long as both scenes have it.
+    """
+    if not np.isfinite([scale, sigma_scale]).all():
+        return np.zeros((3, 3))
+    shared_m = a.points_m[refined.shared.pairs[:, 0]].mean(0)
+    arm_m = se3.apply(refined.a_from_b, at_b[None])[0] - shared_m
+    result: Floats = np.outer(arm_m, arm_m) * ((scale - 1.0) ** 2 + sigma_scale**2)
+    return result
+
+
+def with_bends(covariance: Floats) -> Floats:
+    """A seam's covariance (6, 6) with what the scenes' bends there add."""
+    result: Floats = covariance + np.diag([LEAST_SIGMA_RAD**2] * 3 + [LEAST_SIGMA_M**2] * 3)
     return result
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from mrasfm_engine.aggregation import loops
+from mrasfm_engine.aggregation import loops, seam
 from mrasfm_engine.aggregation.loops import Loop, ScenePaths, off_positions
 from mrasfm_engine.aggregation.map_report import loop_findings
 from mrasfm_engine.geometry import se3
@@ -134,8 +134,8 @@ def test_the_cost_grows_with_the_seams() -> None:
 @pytest.mark.slow
 def test_misclosures_are_as_large_as_their_covariance_says(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of right loops: chi-squared, with six degrees of freedom."""
-    monkeypatch.setattr(loops, "LEAST_SIGMA_RAD", 0.0)
-    monkeypatch.setattr(loops, "LEAST_SIGMA_M", 0.0)
+    monkeypatch.setattr(seam, "LEAST_SIGMA_RAD", 0.0)
+    monkeypatch.setattr(seam, "LEAST_SIGMA_M", 0.0)
     squared = []
     for seed in range(150):
         case = simulate(*ring(8, SIDE_M), np.random.default_rng(seed))
