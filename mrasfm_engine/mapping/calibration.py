@@ -165,7 +165,7 @@ def hold_baselines(mapper: Mapper, certainty: Covariances, *, most_behind_px: fl
 
 
 def _moves_images_px(mapper: Mapper, scene: float, baselines: float) -> float:
-    """How far points move in images, about, where the scene and the baselines are scaled by these factors."""
+    """Shift of points in images, about, where the scene and the baselines are scaled by these factors."""
     from_mean_m = baselines * np.linalg.norm(_about_their_mean(mapper.state.camera_position_m), axis=1)
     away_m = abs(scene / baselines - 1.0) * float(from_mean_m.max())
     focal_px = float(mapper.state.camera_params[:, :2].mean())

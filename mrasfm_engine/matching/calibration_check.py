@@ -129,7 +129,7 @@ def _motion_agreement(
     where: dict[tuple[int, int], int],
     verified: Callable[[int, int], tuple[Floats, Floats] | None],
 ) -> list[float] | None:
-    """How well the cameras' directions of motion agree (0..1) in every hypothesis of the rig."""
+    """Agreement (0..1) of the cameras' directions of motion in every hypothesis of the rig."""
     directions = []
     for camera in range(len(rigs[0])):
         if (unit, camera) not in where or (unit + 1, camera) not in where:

@@ -16,6 +16,7 @@ from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.implausible_lengths import length_findings
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.receiver_findings import jump_findings, refusal_findings
@@ -154,7 +155,7 @@ def _refined(
         findings.append(miscalibration.pair_finding(names, refined.wrong_pair))
     findings += mapping_report.idle_camera_findings(mapper)
     findings += mapping_report.motion_findings(mapper)
-    findings += mapping_report.scale_findings(refined)
+    findings += mapping_report.scale_findings(refined) + length_findings(mapper, refined)
     report = {
         **mapping_report.describe_refinement(mapper, refined),
         **mapping_report.describe_between(mapper, between),

@@ -1,0 +1,50 @@
+"""Lengths that no road vehicle has: its speed, and how high its cameras stand above the road.
+
+Without positions, the scale of a scene rests on baselines of the rig and on what cameras see together. Where that is
+little, and the rig is not as given, a scene may be many times too long and seem certain of it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.refinement_result import Refinement
+from mrasfm_engine.mapping.road import RoadAssessment
+from schemas.findings import Finding, warning
+
+MAX_SPEED_MPS = 70.0  # 250 km/h: cars that map roads drive no faster
+CAMERA_HEIGHT_M = 0.2, 6.0  # from a bumper's to above the roof of a lorry
+
+
+def length_findings(mapper: Mapper, refinement: Refinement) -> list[Finding]:
+    """Warn where the scene's lengths are those of no road vehicle."""
+    signs = [sign for sign in (_speed(mapper), _camera_height(mapper, refinement)) if sign is not None]
+    if not signs:
+        return []
+    return [
+        warning(
+            "implausible-lengths",
+            f"lengths of the scene are hardly right, whatever their stated uncertainty: in it {' and '.join(signs)}",
+            "Check frames' timestamps and the translations in rig.cameras, which are in metres; give GNSS positions, "
+            "or a calibration that is known better.",
+        )
+    ]
+
+
+def _speed(mapper: Mapper) -> str | None:
+    units = np.flatnonzero(mapper.registered)
+    elapsed_s = np.diff(mapper.drive.timestamps_us[units]) / 1e6
+    if not len(elapsed_s):
+        return None
+    ways_m = np.linalg.norm(np.diff(mapper.state.unit_position_m[units], axis=0), axis=1)
+    speed_mps = float(np.median(ways_m / elapsed_s))
+    return f"the vehicle drives {speed_mps:.0f} m/s as a rule" if speed_mps > MAX_SPEED_MPS else None
+
+
+def _camera_height(mapper: Mapper, refinement: Refinement) -> str | None:
+    if not isinstance(refinement.road, RoadAssessment):
+        return None
+    height_m = refinement.road.road.rig_height_m + float(np.median(mapper.state.camera_position_m[:, 2]))
+    low_m, high_m = CAMERA_HEIGHT_M
+    return None if low_m <= height_m <= high_m else f"cameras stand {height_m:.1f} m above the road"
