@@ -10,7 +10,8 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
     covariances,
 )
-from mrasfm_engine.bundle_adjustment.priors import Term
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
+from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import (
@@ -40,6 +41,7 @@ from mrasfm_engine.mapping.miscalibration import (
     find_wrong_pair,
 )
 from mrasfm_engine.mapping.moving_objects import drop_moving
+from mrasfm_engine.mapping.other_sizes import with_other_sizes
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement_result import (
     Refinement,
@@ -208,6 +210,10 @@ def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -
 def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
     """Say how certain everything is, hold what the drive does not observe, and find what is not as it was given."""
     result.certainty = certainty_of(mapper, result)
+    if result.certainty is not None and not result.georeferenced and not mapper.drive.has_single_camera:
+        result.certainty = with_other_sizes(
+            mapper, result.certainty, lambda: _adjust_all_cameras(mapper, result, free_units, cancel)
+        )
     result.directions = observed_directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
@@ -287,6 +293,20 @@ def _adjust(
     if result.intrinsics_vary:
         mapper.renew_rays()
     _rescale(mapper, result, terms)
+
+
+def _adjust_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> Report:
+    """Adjust with all cameras free under their prior, those that are held as well."""
+    others = [term for term in terms_of(mapper, result) if not isinstance(term, CalibrationPrior)]
+    return adjust_poses(
+        mapper,
+        free_units & mapper.registered,
+        free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
+        free_times=result.recalibrated if result.times_vary else None,
+        terms=[calibration_prior(mapper), *others],
+        options=solver_options(mapper, result.sigma_px, rough=False),
+        cancel=cancel,
+    )
 
 
 def _unbend(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> bool:
