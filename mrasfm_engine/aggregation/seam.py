@@ -191,7 +191,9 @@ def _judged(
     scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
     at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
     covariance = _about(refined.covariance, b, refined.a_from_b, at)
-    covariance[3:, 3:] += _error_by_lengths(a, refined, at, scale, sigma_scale)
+    covariance[3:, 3:] += _error_by_lengths(
+        a, refined, at, min(max(abs(scale - 1.0), sigma_scale), settings.max_scale_error)
+    )
     stated = with_bends(covariance)
     shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
     turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ coarse[:3, :3].T))
@@ -284,16 +286,14 @@ def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -
     return result
 
 
-def _error_by_lengths(a: SourceScene, refined: RefinedSeam, at_b: Floats, scale: float, sigma_scale: float) -> Floats:
-    """Covariance (3, 3) of the shift at a place of b that the scenes' different lengths make.
+def _error_by_lengths(a: SourceScene, refined: RefinedSeam, at_b: Floats, difference: float) -> Floats:
+    """Covariance (3, 3) of the shift at a place of b that a relative difference of the scenes' lengths makes.
 
     A rigid transform lays shared points on one another. From there to b's units it is as long as both scenes have it.
     """
-    if not np.isfinite([scale, sigma_scale]).all():
-        return np.zeros((3, 3))
     shared_m = a.points_m[refined.shared.pairs[:, 0]].mean(0)
     arm_m = se3.apply(refined.a_from_b, at_b[None])[0] - shared_m
-    result: Floats = np.outer(arm_m, arm_m) * ((scale - 1.0) ** 2 + sigma_scale**2)
+    result: Floats = np.outer(arm_m, arm_m) * difference**2
     return result
 
 

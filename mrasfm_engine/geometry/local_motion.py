@@ -11,8 +11,8 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_GAP_S = 2.5  # a pose farther away in time says nothing of how the vehicle moves now
 MIN_GAP_S = 0.02  # poses closer in time than this would turn their noise into speed
-# Of the interval to a neighbour. A camera whose clock is an interval late takes its images beyond the neighbours; there
-# a parabola still holds, to 5 mm at 5 m/s^3 of jerk and 0.1 s between units.
+# Of the intervals to the neighbours before and after. A camera whose clock is an interval late takes its images beyond
+# them; there a parabola still holds, to 5 mm at 5 m/s^3 of jerk and 0.1 s between units.
 REACH = 2.0
 # Of vehicles on roads. A neighbour whose pose is wrong would ask for more.
 MAX_ACCELERATION_MPS2 = 12.0
@@ -114,11 +114,12 @@ def local_motion(world_from_rig: Floats, time_s: Floats, known: Bools) -> LocalM
     ends = both & ~middle
     velocity[ends] = rates[0][ends] - bend[ends] * gaps[0][ends, None]
     reach = np.where(first >= 0, np.abs(gaps[0]), 0.0)
+    beyond_s = np.where(both, gaps[1], 0.0)
     return LocalMotion(
         velocity=velocity,
         bend=bend,
-        earliest_s=-REACH * reach,
-        latest_s=REACH * np.where(middle, gaps[1], reach),
+        earliest_s=np.where(middle, -REACH * reach, np.minimum(-reach, beyond_s)),
+        latest_s=np.where(middle, REACH * beyond_s, np.maximum(reach, beyond_s)),
         support=support,
         support_s=np.stack(gaps, axis=1),
     )

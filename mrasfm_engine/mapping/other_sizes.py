@@ -24,7 +24,8 @@ UNSURE = 0.05  # of the scale by images alone: where they know it better, its cu
 def with_other_sizes(mapper: Mapper, certainty: Covariances, adjust: Callable[[], Report]) -> Covariances:
     """The certainty with a scale no better known than sizes of equal cost leave it.
 
-    A scene that costs half the square of n more at another size is n standard deviations from there.
+    A size that costs half the square of n more than the best is n standard deviations away. Of a scene that costs the
+    same at all sizes the sigma is as far as they were tried, the logarithm of the largest of `FACTORS`.
 
     Parameters
     ----------
@@ -33,18 +34,18 @@ def with_other_sizes(mapper: Mapper, certainty: Covariances, adjust: Callable[[]
     """
     if not UNSURE < sigma_scale_of_images(mapper, certainty) < np.inf:
         return certainty
-    kept = mapper.state
-    logs, costs = [], []
-    for factor in (1.0, *FACTORS):
-        mapper.state = copy.deepcopy(kept)
-        scale_scene(mapper, factor)
-        costs.append(adjust().final_cost)
-        logs.append(np.log(_size_m(mapper)))
-    mapper.state = kept
-    mapper.renew_motion()
-    away = np.abs(np.array(logs[1:]) - logs[0])
-    sigmas = np.sqrt(np.maximum(2.0 * (np.array(costs[1:]) - costs[0]), 1.0))
-    sigma = float((away / sigmas).max())
+    kept, found_m = (mapper.state, mapper.motion), _size_m(mapper)
+    away, costs = [], []
+    try:
+        for factor in (1.0, *FACTORS):
+            mapper.state, mapper.motion = copy.deepcopy(kept)
+            scale_scene(mapper, factor)
+            costs.append(adjust().final_cost)
+            away.append(abs(np.log(_size_m(mapper) / found_m)))
+    finally:
+        mapper.state, mapper.motion = kept
+    sigmas = np.sqrt(np.maximum(2.0 * (np.array(costs) - min(costs)), 1.0))
+    sigma = float((np.array(away) / sigmas).max())
     return certainty.with_scale_error(float(np.sqrt(max(sigma**2 - certainty.sigma_scale**2, 0.0))))
 
 

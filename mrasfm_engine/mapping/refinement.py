@@ -296,15 +296,17 @@ def _adjust(
 
 
 def _adjust_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> Report:
-    """Adjust with all cameras free under their prior, those that are held as well."""
-    others = [term for term in terms_of(mapper, result) if not isinstance(term, CalibrationPrior)]
+    """Adjust with all cameras and their times free under their priors, those that are held as well."""
+    terms = [term for term in terms_of(mapper, result) if not isinstance(term, CalibrationPrior)]
+    if times_may_vary(mapper) and not result.times_vary:
+        terms.append(time_prior(mapper, mean_varies=False))
     return adjust_poses(
         mapper,
         free_units & mapper.registered,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
-        free_times=result.recalibrated if result.times_vary else None,
-        terms=[calibration_prior(mapper), *others],
-        options=solver_options(mapper, result.sigma_px, rough=False),
+        free_times=np.full(len(mapper.camera_kind), times_may_vary(mapper)),
+        terms=[calibration_prior(mapper), *terms],
+        options=solver_options(mapper, result.sigma_px),
         cancel=cancel,
     )
 

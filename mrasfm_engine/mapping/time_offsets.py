@@ -155,6 +155,8 @@ def assess_times(prior: TimePrior, certainty: Covariances, error_s: Floats, offs
     # What errors of all cameras do to the trajectory is common to them.
     after_s = sigma_s(certainty.times_s2 + np.outer(error_s, error_s) + (error_s**2).mean())
     independent_s = sigma_s(certainty.times_of_independent_errors_s2)
+    if prior.gauge_weights is not None:
+        offset_s = offset_s - np.average(offset_s, weights=prior.gauge_weights)
     is_far = np.abs(offset_s) > BEYOND_PRIOR_SIGMAS * np.maximum(prior.sigma_s, after_s)
     return TimeCertainty(
         sigma_s=after_s,

@@ -142,16 +142,18 @@ def _motion_agreement(
             directions.append([rig[camera, :3, :3] @ direction for rig in rigs])
     if len(directions) < 2:
         return None
-    return [_agreement(of_rig) for of_rig in np.swapaxes(np.array(directions), 0, 1)]
+    given, *others = np.swapaxes(np.array(directions), 0, 1)
+    # What was given may be rough; what is meant instead has to fit.
+    return [_agreement(given, LARGEST_TURN_DEG + AGREE_DEG), *(_agreement(of_rig, AGREE_DEG) for of_rig in others)]
 
 
-def _agreement(directions: Floats) -> float:
+def _agreement(directions: Floats, within_deg: float) -> float:
     """Share of unit vectors (n, 3) that agree with one of them, less what they differ by: 0 to 1.
 
     A vehicle that overtakes fills one camera's image and turns its direction around. The mean of all would be shorter
     under the right rig, where the others agree to a degree, than under one that scatters all of them.
     """
-    near = directions @ directions.T > np.cos(np.radians(AGREE_DEG))
+    near = directions @ directions.T > np.cos(np.radians(within_deg))
     most = near[int(near.sum(axis=1).argmax())]
     return float(np.linalg.norm(directions[most].sum(axis=0)) / len(directions))
 

@@ -112,13 +112,15 @@ def test_a_parabola_goes_on_beyond_the_neighbours() -> None:
     np.testing.assert_allclose(motion.velocity_at(unit, offset_s)[:, 3], 5.0 + 3.0 * (time_s[unit] + offset_s))
 
 
-def test_nothing_is_said_of_times_far_beyond_the_neighbours() -> None:
+@pytest.mark.parametrize(("unit", "until_s"), [(0, 0.1), (1, 0.1 * REACH), (2, 0.1)])
+def test_nothing_is_said_of_times_far_beyond_the_neighbours(unit: int, until_s: float) -> None:
+    """At the drive's ends there is no neighbour on one side, and noise grows fast towards there."""
     time_s = np.array([0.0, 0.1, 0.2])
     motion = local_motion(driven(time_s), time_s, all_known(time_s))
-    far_s = 0.1 * REACH
-    unit = np.array([1, 1])
-    np.testing.assert_array_equal(motion.at(unit, np.array([5.0, -5.0])), motion.at(unit, np.array([far_s, -far_s])))
-    assert not motion.velocity_at(unit, np.array([5.0, -5.0])).any()
+    back_s, ahead_s = (0.1, 0.2) if unit == 0 else (0.2, 0.1) if unit == 2 else (until_s, until_s)
+    units, far_s = np.array([unit, unit]), np.array([-5.0, 5.0])
+    np.testing.assert_array_equal(motion.at(units, far_s), motion.at(units, np.array([-back_s, ahead_s])))
+    assert not motion.velocity_at(units, far_s).any()
 
 
 def test_poses_at_almost_the_same_time_do_not_turn_noise_into_speed() -> None:

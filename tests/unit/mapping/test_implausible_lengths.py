@@ -26,5 +26,5 @@ def test_lengths_that_no_vehicle_has_are_said_whatever_their_sigma() -> None:
 
     scale_with_baselines(mapper, 10.0)
     (said,) = length_findings(mapper, Refinement(road="nothing shows it"))
-    assert "the vehicle drives 110 m/s" in said.what
+    assert "the vehicle drives up to 111 m/s" in said.what
     assert "cameras" not in said.what

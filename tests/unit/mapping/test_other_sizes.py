@@ -7,6 +7,8 @@ import pytest
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
+from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import calibration_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.other_sizes import FACTORS, UNSURE, with_other_sizes
@@ -17,8 +19,8 @@ FREE = np.arange(UNITS) > 0
 OPTIONS = SolverOptions(sigma_px=0.5)
 
 
-def assessed(mapper: Mapper, sigma_scale: float) -> Covariances:
-    """The certainty of a scene, with another curvature along its scale; images alone say it."""
+def assessed(mapper: Mapper, sigma_scale: float) -> tuple[Covariances, int]:
+    """The certainty of a scene, with another curvature along its scale, and how often the scene was adjusted."""
     problem, _ = mapper.problem(
         FREE, free_cameras=np.ones(2, dtype=np.bool_), terms=[calibration_prior(mapper)], options=OPTIONS
     )
@@ -26,26 +28,33 @@ def assessed(mapper: Mapper, sigma_scale: float) -> Covariances:
     unknown = np.full_like(certainty.scale_with_calibration, np.nan)
     certainty = replace(certainty, sigma_scale=sigma_scale, scale_with_calibration=unknown)
 
+    adjustments: list[Report] = []
+
     def adjust() -> Report:
-        return adjust_poses(
+        report = adjust_poses(
             mapper, FREE, free_cameras=np.ones(2, dtype=np.bool_), terms=[calibration_prior(mapper)], options=OPTIONS
         )
+        adjustments.append(report)
+        return report
 
-    return with_other_sizes(mapper, certainty, adjust)
+    return with_other_sizes(mapper, certainty, adjust), len(adjustments)
 
 
 def test_a_scene_that_costs_the_same_at_other_sizes_is_as_uncertain_as_these_are_apart() -> None:
     """One of two cameras sees nothing: images of the other say nothing of how large the scene is."""
     mapper = true_model(cameras=2)
     mapper.is_inlier[mapper.keypoints.camera == 1] = False
-    before = mapper.state.unit_position_m.copy()
-    found = assessed(mapper, sigma_scale=0.1)
+    state, motion, before = mapper.state, mapper.motion, mapper.state.unit_position_m.copy()
+    found, _ = assessed(mapper, sigma_scale=0.1)
     assert found.sigma_scale == pytest.approx(np.log(max(FACTORS)), rel=0.2)
+    assert mapper.state is state
+    assert mapper.motion is motion
     np.testing.assert_array_equal(mapper.state.unit_position_m, before)
 
 
 def test_a_scene_that_comes_back_from_other_sizes_is_as_certain_as_it_was() -> None:
-    found = assessed(true_model(cameras=2), sigma_scale=0.1)
+    found, adjusted = assessed(true_model(cameras=2), sigma_scale=0.1)
+    assert adjusted == 1 + len(FACTORS)
     assert found.sigma_scale == pytest.approx(0.1, rel=0.01)
 
 
@@ -53,4 +62,29 @@ def test_a_scene_that_comes_back_from_other_sizes_is_as_certain_as_it_was() -> N
 def test_other_sizes_are_tried_only_where_images_know_the_scale_badly(sigma_scale: float) -> None:
     mapper = true_model(cameras=2)
     mapper.is_inlier[mapper.keypoints.camera == 1] = False
-    assert assessed(mapper, sigma_scale=sigma_scale).sigma_scale == sigma_scale
+    found, adjusted = assessed(mapper, sigma_scale=sigma_scale)
+    assert (found.sigma_scale, adjusted) == (sigma_scale, 0)
+
+
+def test_images_with_poses_of_their_own_keep_them() -> None:
+    """As what is adjusted on the way, the poses are scaled with the scene."""
+    mapper = true_model(cameras=2)
+    mapper.set_image_pose(3, se3.transform(np.eye(3), [0.5, 0.0, 0.0]))
+    before = mapper.motion.own_poses[1].copy()
+    _, adjusted = assessed(mapper, sigma_scale=0.1)
+    assert adjusted
+    np.testing.assert_array_equal(mapper.motion.own_poses[1], before)
+
+
+def test_a_cancelled_trial_leaves_the_scene_as_it_was() -> None:
+    mapper = true_model(cameras=2)
+    state, motion = mapper.state, mapper.motion
+
+    def cancelled() -> Report:
+        raise CancelledError
+
+    certainty, _ = assessed(mapper, sigma_scale=np.inf)
+    with pytest.raises(CancelledError):
+        with_other_sizes(mapper, replace(certainty, sigma_scale=0.1), cancelled)
+    assert mapper.state is state
+    assert mapper.motion is motion

@@ -11,7 +11,7 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
-from mrasfm_engine.mapping.time_offsets import assess_times, time_prior, times_may_vary
+from mrasfm_engine.mapping.time_offsets import assess_times, offsets_are_steady, time_prior, times_may_vary
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -141,6 +141,18 @@ def test_a_camera_that_is_late_by_more_than_an_interval_is_found_and_said_to_be(
     assert found is not None
     assert found.observed.tolist() == [False, False, True, False]
     assert found.to_hold.tolist() == [True, True, False, True]
+
+
+def test_offsets_are_steady_until_one_moves_among_the_others_by_more_than_its_prior_allows() -> None:
+    mapper, _ = model([0] * 4, sigma_time_offset_us=2000.0)
+    for moved_ms, steady in (
+        ([0, 0, 0, 0], True),
+        ([50, 50, 50, 50], True),
+        ([0, 7, 0, 0], True),
+        ([0, 9, 0, 0], False),
+    ):
+        mapper.state.camera_time_offset_s[:] = 1e-3 * np.array(moved_ms)
+        assert offsets_are_steady(mapper, np.zeros(4)) == steady
 
 
 def test_cameras_that_are_simultaneous_have_no_offset_unless_the_manifest_says_so() -> None:

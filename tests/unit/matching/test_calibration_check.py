@@ -144,6 +144,14 @@ def test_an_inverted_rectified_stereo_pair_in_kittis_axes_is_refused() -> None:
         check(rectified_stereo(given))
 
 
+@pytest.mark.parametrize("off_deg", [12.0, 18.0])
+def test_a_stereo_pair_given_far_off_is_not_called_inverted(off_deg: float) -> None:
+    """Under its inverse a turn about the vehicle's up axis leaves the direction of motion as it is."""
+    given = RECTIFIED.copy()
+    given[1, :3, :3] = se3.exp_so3(np.radians([0, 0, off_deg])) @ given[1, :3, :3]
+    check(rectified_stereo(given))
+
+
 def test_one_camera_off_by_3_degrees_is_not_called_inverted() -> None:
     def given(rig_from_cam: np.ndarray) -> np.ndarray:
         rig_from_cam[1, :3, :3] = se3.exp_so3(np.radians([0, 0, 3.0])) @ rig_from_cam[1, :3, :3]
