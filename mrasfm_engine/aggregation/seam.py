@@ -23,7 +23,7 @@ from mrasfm_engine.aggregation.seam_refinement import (
     scale_ratio,
 )
 from mrasfm_engine.aggregation.source import SourceScene
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.config import AggregationConfig, EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.matching.prepared_images import Matcher
@@ -191,9 +191,9 @@ def _judged(
     scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
     at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
     covariance = _about(refined.covariance, b, refined.a_from_b, at)
-    covariance[3:, 3:] += _error_by_lengths(
-        a, refined, at, min(max(abs(scale - 1.0), sigma_scale), settings.max_scale_error)
-    )
+    of_a = a.world_from_rig[units_a if len(units_a) else np.flatnonzero(a.unit_registered)].mean(0)[:3, 3]
+    apart_m = se3.apply(refined.a_from_b, at[None])[0] - of_a
+    covariance[3:, 3:] += np.outer(apart_m, apart_m) * _difference_of_lengths(scale, sigma_scale, settings) ** 2
     stated = with_bends(covariance)
     shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
     turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ coarse[:3, :3].T))
@@ -286,15 +286,12 @@ def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -
     return result
 
 
-def _error_by_lengths(a: SourceScene, refined: RefinedSeam, at_b: Floats, difference: float) -> Floats:
-    """Covariance (3, 3) of the shift at a place of b that a relative difference of the scenes' lengths makes.
+def _difference_of_lengths(scale: float, sigma_scale: float, settings: AggregationConfig) -> float:
+    """Relative difference of the scenes' lengths, that the way between their vehicles at the seam may be off by.
 
-    A rigid transform lays shared points on one another. From there to b's units it is as long as both scenes have it.
+    Where both drove at one place there is none: points that are too far on the same line of sight move in no image.
     """
-    shared_m = a.points_m[refined.shared.pairs[:, 0]].mean(0)
-    arm_m = se3.apply(refined.a_from_b, at_b[None])[0] - shared_m
-    result: Floats = np.outer(arm_m, arm_m) * difference**2
-    return result
+    return min(max(abs(scale - 1.0), sigma_scale), settings.max_scale_error)
 
 
 def with_bends(covariance: Floats) -> Floats:

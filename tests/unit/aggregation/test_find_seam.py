@@ -157,10 +157,9 @@ def test_lengths_that_differ_are_found_and_refused_beyond_the_limit(
     assert 2.4 < float(strict.reason.split()[-2]) < 3.6
 
 
-def test_where_lengths_differ_a_place_away_from_what_is_shared_is_less_certain(
+def test_where_lengths_differ_vehicles_at_different_places_are_less_certain_of_their_distance(
     street: Street, folder: Path, a: Driven
 ) -> None:
-    """The scenes meet where both see points, and differ by their lengths from there to the vehicle."""
     scale = 0.97
     behind = drive_along(street, folder / "behind", np.arange(-9.0, -1.0, 2.0), scale=scale, seed=9)
     seam = seam_of(a, behind)
@@ -169,6 +168,9 @@ def test_where_lengths_differ_a_place_away_from_what_is_shared_is_less_certain(
     off_m = float(np.linalg.norm(se3.apply(seam.a_from_b, seam.place_b_m[None]) - truth_m))
     assert off_m > 0.1
     assert off_m < 2.0 * seam.quality["sigma_translation_m"]
+    beside = seam_of(a, drive_along(street, folder / "beside", WAY_A + 0.5, scale=scale, seed=10))
+    assert beside.accepted, beside.reason
+    assert beside.quality["sigma_translation_m"] < 0.3 * seam.quality["sigma_translation_m"]
 
 
 def test_without_agreeing_units_nothing_but_the_number_of_points_is_asked(
