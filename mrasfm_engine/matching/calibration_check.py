@@ -143,8 +143,9 @@ def _motion_agreement(
     if len(directions) < 2:
         return None
     given, *others = np.swapaxes(np.array(directions), 0, 1)
-    # What was given may be rough; what is meant instead has to fit.
-    return [_agreement(given, LARGEST_TURN_DEG + AGREE_DEG), *(_agreement(of_rig, AGREE_DEG) for of_rig in others)]
+    # What was given may be rough, and of two cameras neither is in the majority; what is meant instead has to fit.
+    most_deg = LARGEST_TURN_DEG + AGREE_DEG if len(directions) > 2 else 180.0
+    return [_agreement(given, most_deg), *(_agreement(of_rig, AGREE_DEG) for of_rig in others)]
 
 
 def _agreement(directions: Floats, within_deg: float) -> float:
@@ -153,7 +154,7 @@ def _agreement(directions: Floats, within_deg: float) -> float:
     A vehicle that overtakes fills one camera's image and turns its direction around. The mean of all would be shorter
     under the right rig, where the others agree to a degree, than under one that scatters all of them.
     """
-    near = directions @ directions.T > np.cos(np.radians(within_deg))
+    near = directions @ directions.T >= np.cos(np.radians(within_deg))
     most = near[int(near.sum(axis=1).argmax())]
     return float(np.linalg.norm(directions[most].sum(axis=0)) / len(directions))
 
