@@ -189,10 +189,9 @@ def _judged(
     settings = config.aggregation
     units_a, units_b = (_units_at(assembly, refined.shared, side) for side in (0, 1))
     scale, sigma_scale = scale_ratio(assembly, refined.a_from_b, refined.shared)
-    at = b.world_from_rig[units_b if len(units_b) else np.flatnonzero(b.unit_registered)].mean(0)[:3, 3]
+    at = _middle_m(b, units_b)
     covariance = _about(refined.covariance, b, refined.a_from_b, at)
-    of_a = a.world_from_rig[units_a if len(units_a) else np.flatnonzero(a.unit_registered)].mean(0)[:3, 3]
-    apart_m = se3.apply(refined.a_from_b, at[None])[0] - of_a
+    apart_m = se3.apply(refined.a_from_b, at[None])[0] - _middle_m(a, units_a)
     covariance[3:, 3:] += np.outer(apart_m, apart_m) * _difference_of_lengths(scale, sigma_scale, settings) ** 2
     stated = with_bends(covariance)
     shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
@@ -274,6 +273,13 @@ def _units_at(assembly: Assembly, shared: Shared, side: int) -> Ints:
     image = np.searchsorted(scene.keypoint_first, rows, side="right") - 1
     counts = np.bincount(scene.image_unit[image], minlength=len(scene.unit_registered))
     return np.flatnonzero(counts >= MIN_POINTS_OF_UNIT)
+
+
+def _middle_m(scene: SourceScene, units: Ints) -> Floats:
+    """The middle (3,) of some units of a scene, or of all that are registered where there are none."""
+    chosen = units if len(units) else np.flatnonzero(scene.unit_registered)
+    result: Floats = scene.world_from_rig[chosen].mean(0)[:3, 3]
+    return result
 
 
 def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -> Floats:

@@ -10,7 +10,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
     MAX_UNKNOWNS_FOR_COVARIANCE,
     covariances,
 )
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
+from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
@@ -49,6 +49,7 @@ from mrasfm_engine.mapping.refinement_result import (
     free_units_of,
     solver_options,
     terms_of,
+    terms_of_all_cameras,
 )
 from mrasfm_engine.mapping.road import drop_off_road, road_where_points_are
 from mrasfm_engine.mapping.time_offsets import (
@@ -297,15 +298,12 @@ def _adjust(
 
 def _adjust_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> Report:
     """Adjust with all cameras and their times free under their priors, those that are held as well."""
-    terms = [term for term in terms_of(mapper, result) if not isinstance(term, CalibrationPrior)]
-    if times_may_vary(mapper) and not result.times_vary:
-        terms.append(time_prior(mapper, mean_varies=False))
     return adjust_poses(
         mapper,
         free_units & mapper.registered,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
         free_times=np.full(len(mapper.camera_kind), times_may_vary(mapper)),
-        terms=[calibration_prior(mapper), *terms],
+        terms=terms_of_all_cameras(mapper, result),
         options=solver_options(mapper, result.sigma_px),
         cancel=cancel,
     )

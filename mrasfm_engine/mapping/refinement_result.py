@@ -130,6 +130,19 @@ def terms_of(mapper: Mapper, result: Refinement) -> list[Term]:
     return terms + result.absolute.terms(mapper)
 
 
+def terms_of_all_cameras(mapper: Mapper, result: Refinement) -> list[Term]:
+    """The same where all cameras and their times vary under their priors, also where these were held: their errors are
+    there as well.
+    """
+    is_kept = result.calibration.free or result.is_of_one_camera
+    terms = [term for term in terms_of(mapper, result) if is_kept or not isinstance(term, CalibrationPrior)]
+    if not mapper.drive.has_single_camera and not result.calibration.free:
+        terms.append(calibration_prior(mapper))
+    if times_may_vary(mapper) and not result.times_vary:
+        terms.append(time_prior(mapper, mean_varies=False))
+    return terms
+
+
 def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
     """Covariances with the calibration free under its prior, also where it was held: its error is there as well.
 
@@ -137,11 +150,7 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
     """
     if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
         return None
-    several = not mapper.drive.has_single_camera
-    is_kept = result.calibration.free or result.is_of_one_camera
-    terms = [term for term in terms_of(mapper, result) if is_kept or not isinstance(term, CalibrationPrior)]
-    if several and not result.calibration.free:
-        terms.append(calibration_prior(mapper))
+    several, terms = not mapper.drive.has_single_camera, terms_of_all_cameras(mapper, result)
     free_intrinsics = None
     if result.intrinsics is not None and result.intrinsics.asked:
         # Whoever lets the focal length vary is not certain of the others either.
@@ -150,7 +159,6 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
             terms.append(intrinsics_prior(mapper))
     times_vary = several and times_may_vary(mapper)
     if times_vary:
-        terms += [] if result.times_vary else [time_prior(mapper, mean_varies=False)]
         terms.append(ReadoutPrior(sigma_s=SIGMA_READOUT_S))
     problem, _ = mapper.problem(
         free_units_of(mapper, result.absolute),

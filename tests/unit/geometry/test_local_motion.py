@@ -112,12 +112,11 @@ def test_a_parabola_goes_on_beyond_the_neighbours() -> None:
     np.testing.assert_allclose(motion.velocity_at(unit, offset_s)[:, 3], 5.0 + 3.0 * (time_s[unit] + offset_s))
 
 
-@pytest.mark.parametrize(("unit", "until_s"), [(0, 0.1), (1, 0.1 * REACH), (2, 0.1)])
-def test_nothing_is_said_of_times_far_beyond_the_neighbours(unit: int, until_s: float) -> None:
+@pytest.mark.parametrize(("unit", "back_s", "ahead_s"), [(0, 0.1, 0.2), (1, 0.1 * REACH, 0.1 * REACH), (2, 0.2, 0.1)])
+def test_nothing_is_said_of_times_far_beyond_the_neighbours(unit: int, back_s: float, ahead_s: float) -> None:
     """At the drive's ends there is no neighbour on one side, and noise grows fast towards there."""
     time_s = np.array([0.0, 0.1, 0.2])
     motion = local_motion(driven(time_s), time_s, all_known(time_s))
-    back_s, ahead_s = (0.1, 0.2) if unit == 0 else (0.2, 0.1) if unit == 2 else (until_s, until_s)
     units, far_s = np.array([unit, unit]), np.array([-5.0, 5.0])
     np.testing.assert_array_equal(motion.at(units, far_s), motion.at(units, np.array([-back_s, ahead_s])))
     assert not motion.velocity_at(units, far_s).any()
