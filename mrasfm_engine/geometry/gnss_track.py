@@ -133,27 +133,43 @@ def find_gross_errors(timestamps_us: Ints, position_m: Floats, sigma_m: Floats, 
 
     The line is fitted with L1 weights, so that single neighbours that are wrong themselves do little. It may be as far
     off as a vehicle gets from a straight line that accelerates as hard as it can meanwhile: of a receiver with few
-    samples a second only large errors show here, and the scene shows the others.
+    samples a second only large errors show here, and the scene shows the others. A sample that only wrong neighbours
+    have drawn the line away from, as at the ends of a short drive, is none: each is judged again without them.
     """
-    n = len(timestamps_us)
-    bad = np.zeros(n, dtype=np.bool_)
-    t = timestamps_us / 1e6
-    for i in range(n):
-        dt = t[max(0, i - NEIGHBOURS) : i + NEIGHBOURS + 1] - t[i]
-        near = np.flatnonzero((np.abs(dt) <= _span_s(dt)) & (np.arange(len(dt)) != min(i, NEIGHBOURS)))
+    everyone, time_s = np.arange(len(timestamps_us)), timestamps_us / 1e6
+
+    def far(i: int, near: Ints) -> bool:
         if len(near) < MIN_NEIGHBOURS:
-            continue
-        off_m = position_m[i] - _line_at(dt[near], position_m[near + max(0, i - NEIGHBOURS)])
-        bend_m = 0.5 * HARDEST_MPS2 * float((dt[near] ** 2).mean())
-        far = np.linalg.norm(off_m / sigma_m[i]) > outlier_sigmas
-        bad[i] = far and np.linalg.norm(off_m) > max(MIN_JUMP_M, bend_m)
+            return False
+        dt = time_s[near] - time_s[i]
+        off_m = position_m[i] - _line_at(dt, position_m[near])
+        bend_m = 0.5 * HARDEST_MPS2 * float((dt**2).mean())
+        return bool(
+            np.linalg.norm(off_m / sigma_m[i]) > outlier_sigmas and np.linalg.norm(off_m) > max(MIN_JUMP_M, bend_m)
+        )
+
+    bad = np.array([far(i, _neighbours(i, everyone, time_s)) for i in range(len(time_s))], dtype=np.bool_)
+    others = np.flatnonzero(~bad)
+    for i in np.flatnonzero(bad).tolist():
+        near = _neighbours(i, others, time_s)
+        bad[i] = len(near) < MIN_NEIGHBOURS or far(i, near)
     return bad
 
 
-def _span_s(dt: Floats) -> float:
-    """Half width of the window of neighbours by their times (n,): no wider than some need, as the way bends in it."""
-    enough = np.sort(np.abs(dt))[min(ENOUGH_NEIGHBOURS, len(dt) - 1)]
-    return float(np.clip(enough, USUAL_SPAN_S, NEIGHBOUR_SPAN_S))
+def _neighbours(i: int, among: Ints, time_s: Floats) -> Ints:
+    """Samples out of `among`, ascending, beside sample `i`: a few on each side, in a span that holds enough of them.
+
+    The span is no wider than some need, as the way bends in it.
+    """
+    k = int(np.searchsorted(among, i))
+    after = k + int(k < len(among) and among[k] == i)
+    near = np.concatenate([among[max(0, k - NEIGHBOURS) : k], among[after : after + NEIGHBOURS]])
+    if not len(near):
+        return near
+    apart_s = np.abs(time_s[near] - time_s[i])
+    enough_s = np.sort(apart_s)[min(ENOUGH_NEIGHBOURS, len(near)) - 1]
+    result: Ints = near[apart_s <= np.clip(enough_s, USUAL_SPAN_S, NEIGHBOUR_SPAN_S)]
+    return result
 
 
 def find_held(timestamps_us: Ints, position_m: Floats, sigma_m: Floats) -> Bools:
