@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
+from contextlib import redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -14,11 +16,12 @@ from mrasfm_engine.learned.signatures import Signature, Tensor
 Array = NDArray[Any]
 
 # DirectML is left out: its sessions may run in one thread only.
-GPU_PROVIDERS = ("CUDAExecutionProvider", "ROCMExecutionProvider")
+CUDA_PROVIDER = "CUDAExecutionProvider"
+GPU_PROVIDERS = (CUDA_PROVIDER, "ROCMExecutionProvider")
 CPU_PROVIDER = "CPUExecutionProvider"
 STRIDE_PX = 32  # sides of an image for a network of free size are multiples of it
 _ELEMENT_TYPES = {"float": "float32", "double": "float64", "float16": "float16"}
-_QUIET = 3  # errors only: they become our own
+_QUIET = 4  # onnxruntime writes nothing: its errors become our own
 
 
 class Network:
@@ -56,7 +59,11 @@ class Network:
         there = onnxruntime.get_available_providers()
         providers = [p for p in GPU_PROVIDERS if gpu and p in there] + [CPU_PROVIDER]
         try:
-            self._session = onnxruntime.InferenceSession(data, options, providers=providers)
+            # A command's own output is JSON: onnxruntime prints there where a GPU does not start.
+            with redirect_stdout(sys.stderr):
+                if CUDA_PROVIDER in providers:
+                    onnxruntime.preload_dlls()  # as pip installs CUDA beside onnxruntime-gpu, it lies on no search path
+                self._session = onnxruntime.InferenceSession(data, options, providers=providers)
         except Exception as error:  # onnxruntime raises a dozen kinds without a common root
             raise InputError(
                 f"model {name} cannot be run by onnxruntime {onnxruntime.__version__}: {_first_line(error)}",

@@ -164,3 +164,16 @@ def test_lighterglue_gets_the_units_it_was_trained_with(models: Path, shared_dat
     assert 60 < right <= 1024
     assert wrong < 0.9 * right
     assert plain < 0.8 * right
+
+
+@pytest.mark.parametrize("brightness", [0, 128, 255])
+def test_an_image_that_shows_nothing_has_no_keypoints_though_the_exported_network_fails_on_it(
+    models: Path, brightness: int
+) -> None:
+    extract = components(models).extractor.extract
+    assert len(extract(np.full((370, 1226, 3), brightness, np.uint8), None).xy_px) == 0
+    half = np.zeros((370, 1226, 3), np.uint8)
+    half[100:160, 1100:1180] = np.random.default_rng(0).integers(0, 255, (60, 80, 1))
+    there = extract(half, None).xy_px
+    assert len(there) > 20  # in one tile, while others show nothing
+    assert ((there > [1090, 90]) & (there < [1190, 170])).all()
