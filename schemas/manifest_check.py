@@ -32,8 +32,10 @@ MAX_FRAME_INTERVAL_US = 20_000_000
 USUAL_INTERVAL_US = 100_000
 OTHER_UNITS_US = {"nanoseconds": 1e-3, "milliseconds": 1e3, "seconds": 1e6}
 MAX_CAMERA_ROLL_DEG = 60.0
+LEVEL_DEG = 45.0  # half of what tells one axis from another
 
 _UP_IN_BODY = {BodyAxes.FLU: (0, 0, 1), BodyAxes.RDF: (0, -1, 0), BodyAxes.FRD: (0, 0, -1)}
+_FORWARD_IN_BODY = {BodyAxes.FLU: (1, 0, 0), BodyAxes.RDF: (0, 0, 1), BodyAxes.FRD: (1, 0, 0)}
 
 
 def check_manifest(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:
@@ -201,23 +203,34 @@ def _check_synchronisation(recorded: _Recorded) -> list[Finding]:
 
 
 def _check_rig(manifest: DriveManifest) -> list[Finding]:
-    """Cameras stand about upright on a vehicle; if none does, the rig's axes are not what was said."""
+    """Cameras stand about upright on a vehicle; if none does, the rig's axes are not what was said.
+
+    Unless they stand on edge, as portrait cameras do whose images are stored as they were read: all of them look about
+    level, and not only aside, which wrong axes and poses given as their inverse do not leave so.
+    """
     up = np.array(_UP_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
-    turned = [
-        camera.name
-        for camera in manifest.rig.cameras
-        if _image_up(camera.rig_from_cam) @ up < np.cos(np.radians(MAX_CAMERA_ROLL_DEG))
-    ]
-    if not turned:
+    forward = np.array(_FORWARD_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
+    axes = np.array([_image_axes(camera.rig_from_cam) for camera in manifest.rig.cameras])  # (c, 2, 3)
+    upright = axes[:, 0] @ up
+    turned = upright < np.cos(np.radians(MAX_CAMERA_ROLL_DEG))
+    if not turned.any():
         return []
-    what = f"camera {listed(turned)} is turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
+    names = listed([camera.name for camera, is_turned in zip(manifest.rig.cameras, turned, strict=True) if is_turned])
+    what = f"camera {names} is turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
     remedy = (
         "Check rig.body_axes, that rig_from_cam is the camera's pose in the rig, not its inverse, and that its "
         "quaternion ends with w; camera axes are x right, y down, z forward."
     )
-    if len(turned) == len(manifest.rig.cameras):
-        return [error("rig-axes", what, remedy)]
-    return [warning("camera-turned", what, remedy)]
+    level = np.abs(axes[:, 1] @ up) < np.sin(np.radians(LEVEL_DEG))
+    ahead = np.abs(axes[:, 1] @ forward) > np.cos(np.radians(LEVEL_DEG))
+    on_edge = np.abs(upright) < np.sin(np.radians(LEVEL_DEG))
+    if not turned.all():
+        return [warning("camera-turned", what, remedy)]
+    if level.all() and ahead.any() and on_edge.all():
+        return [warning("rig-axes", what, f"Nothing needs to be done where they stand on edge. {remedy}")]
+    return [
+        error("rig-axes", what, f"{remedy} Of cameras mounted upside down, turn images and calibration by 180 degrees.")
+    ]
 
 
 def _check_extent(recorded: _Recorded) -> list[Finding]:
@@ -317,10 +330,15 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
     return []
 
 
-def _image_up(rig_from_cam: Pose) -> NDArray[np.float64]:
-    """The image's upward direction (3,) in the rig: -y of the camera."""
+def _image_axes(rig_from_cam: Pose) -> NDArray[np.float64]:
+    """The image's upward direction and the optical axis (2, 3) in the rig: -y and z of the camera."""
     x, y, z, w = np.array(rig_from_cam.rotation_xyzw) / np.linalg.norm(rig_from_cam.rotation_xyzw)
-    return np.array([-2 * (x * y - z * w), 2 * (x * x + z * z) - 1, -2 * (y * z + x * w)])
+    return np.array(
+        [
+            [-2 * (x * y - z * w), 2 * (x * x + z * z) - 1, -2 * (y * z + x * w)],
+            [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def main() -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
@@ -326,6 +327,29 @@ def test_wrong_axes_of_the_whole_rig(drive_document: Document, write_drive: Writ
     second["rig_from_cam"]["rotation_xyzw"] = [0, 0, 0, 1]
     drive_document["gnss"]["antenna_in_rig_m"] = [0, -1.8, 0]
     assert findings(write_drive(drive_document)) == {}
+
+
+def test_portrait_cameras_whose_images_lie_on_their_side_are_no_wrong_axes(
+    drive_document: Document, write_drive: WriteDrive
+) -> None:
+    upright = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])  # looks ahead, in forward, left, up
+    cameras = drive_document["rig"]["cameras"]
+
+    def turned_by(*angles_deg: float) -> None:
+        for camera, angle in zip(cameras, angles_deg, strict=True):
+            camera["rig_from_cam"]["rotation_xyzw"] = (
+                (upright * Rotation.from_euler("z", angle, True)).as_quat().tolist()
+            )
+
+    turned_by(90.0, 80.0)
+    assert "on edge" in only(write_drive(drive_document), "rig-axes", Severity.WARNING).remedy
+    turned_by(90.0, -90.0)
+    only(write_drive(drive_document), "rig-axes", Severity.WARNING)
+    turned_by(180.0, 180.0)  # or an aviator's axes
+    assert "upside down" in only(write_drive(drive_document), "rig-axes", Severity.ERROR).remedy
+    for camera in cameras:
+        camera["rig_from_cam"]["rotation_xyzw"] = upright.inv().as_quat().tolist()  # look aside, on edge
+    only(write_drive(drive_document), "rig-axes", Severity.ERROR)
 
 
 def test_findings_read_well(drive_document: Document, write_drive: WriteDrive) -> None:
