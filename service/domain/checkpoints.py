@@ -18,7 +18,7 @@ from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
 from service.storage import blobs
-from service.storage.artifacts import Fetch
+from service.storage.artifacts import Fetch, ObjectMissingError
 from service.storage.blob_writer import StoredFile
 
 log = logging.getLogger("mrasfm.worker")
@@ -82,7 +82,8 @@ def restore(
 ) -> list[str]:
     """Bring finished stages into a folder; the names of the files brought.
 
-    They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again.
+    They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again. Only the store
+    tells that they are: an attempt that was stopped removes its folder while this may be under way still.
     """
     with database.read() as session:
         found = {name: kept for name, kept in _shelved(session, shelf).items() if is_wanted(name)}
@@ -91,7 +92,7 @@ def restore(
     for name, kept in found.items():
         try:
             fetch(kept.key, folder / name)
-        except FileNotFoundError:
+        except ObjectMissingError:
             log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
             with database.write() as session:
                 _forget(session, kept.id)

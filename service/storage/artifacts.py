@@ -48,6 +48,13 @@ _PARTS_OF_PUT = 2  # of 5 MiB
 Fetch = Callable[[str, Path], None]  # as `ArtifactStore.fetch`: key, target
 
 
+class ObjectMissingError(FileNotFoundError):
+    """The store has no such object. A folder of the caller's that is missing raises a plain FileNotFoundError."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(errno.ENOENT, "the artifact store has no such object", key)
+
+
 @dataclass(frozen=True)
 class StoredObject:
     """An object as the store lists it; `changed_us` is when it came."""
@@ -180,26 +187,36 @@ class ArtifactStore:
 
         Raises
         ------
-        FileNotFoundError
+        ObjectMissingError
             Where the store has no such object.
+        FileNotFoundError
+            Where the target has no folder, which says nothing about the object.
         """
         if self._root is not None:
             try:
-                os.link(self._root / key, target)
-            except OSError as error:
-                if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP):
-                    raise
-                with _whole_or_gone(target):
-                    shutil.copy2(self._root / key, target)
+                _link_or_copy(self._root / key, target)
+            except FileNotFoundError:  # the system's own does not tell which of the two is missing
+                self._require_in_folder(key)
+                raise
             return
         check_stop()
-        found = obstore.get(self._store, key)  # first: what is not there leaves no empty file
+        try:
+            found = obstore.get(self._store, key)  # first: what is not there leaves no empty file
+        except FileNotFoundError as error:
+            raise ObjectMissingError(key) from error
         with _whole_or_gone(target):
             with target.open("xb") as file:
                 for chunk in found.stream(min_chunk_size=_CHUNK_BYTES):
                     check_stop()
                     file.write(chunk)
             os.chmod(target, 0o440)
+
+    def _require_in_folder(self, key: str) -> None:
+        assert self._root is not None
+        try:
+            (self._root / key).stat()
+        except FileNotFoundError:
+            raise ObjectMissingError(key) from None
 
     def read(self, key: str) -> bytes:
         """The whole object, for small ones.
@@ -308,6 +325,16 @@ def _whole_or_gone(target: Path) -> Iterator[None]:
     except BaseException:
         target.unlink(missing_ok=True)
         raise
+
+
+def _link_or_copy(path: Path, target: Path) -> None:
+    try:
+        os.link(path, target)
+    except OSError as error:
+        if error.errno not in (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP):
+            raise
+        with _whole_or_gone(target):
+            shutil.copy2(path, target)
 
 
 def _move(path: Path, target: Path) -> None:

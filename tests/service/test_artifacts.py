@@ -8,6 +8,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -114,12 +115,21 @@ def test_a_fetched_file_is_the_object_and_cannot_be_written(stored: ArtifactStor
 def test_what_is_not_there(store: ArtifactStore, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError):
         store.read(KEY)
-    with pytest.raises(FileNotFoundError):
+    with pytest.raises(artifacts.ObjectMissingError):
         store.fetch(KEY, tmp_path / "x")
     assert not (tmp_path / "x").exists()
+    with pytest.raises(artifacts.ObjectMissingError):
+        store.fetch(KEY, tmp_path / "no folder" / "x")
     with pytest.raises(FileNotFoundError):
         read(store, 0, 5)
     store.delete([KEY])
+
+
+def test_a_target_without_a_folder_is_no_missing_object(stored: ArtifactStore, tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError) as raised:
+        stored.fetch(KEY, tmp_path / "no folder" / "x")
+    assert not isinstance(raised.value, artifacts.ObjectMissingError)
+    assert stored.read(KEY) == CONTENT
 
 
 def test_deleted_objects_are_gone(stored: ArtifactStore, tmp_path: Path) -> None:
@@ -198,16 +208,35 @@ def test_a_put_that_fails_leaves_none_under_way(
     assert list(store.objects()) == []
 
 
-def test_a_folder_on_another_disk(tmp_path: Path) -> None:
-    """Where a rename is not possible the bytes are copied, and the copy is whole or not there."""
+@pytest.fixture
+def other_disk(tmp_path: Path) -> Iterator[Path]:
+    """A folder on another file system than `tmp_path`."""
     other = Path("/dev/shm")
     if not other.is_dir() or other.stat().st_dev == tmp_path.stat().st_dev:
         pytest.skip("no second file system")
-    scratch = other / f"adopted-{os.getpid()}"
+    with tempfile.TemporaryDirectory(dir=other) as folder:
+        yield Path(folder)
+
+
+def test_a_folder_on_another_disk(tmp_path: Path, other_disk: Path) -> None:
+    """Where a rename is not possible the bytes are copied, and the copy is whole or not there."""
     store = ArtifactStore(settings_of(tmp_path / "data"))
-    put(store, scratch, CONTENT, KEY)
+    put(store, other_disk / "adopted", CONTENT, KEY)
     assert store.read(KEY) == CONTENT
     assert [item.key for item in store.objects()] == [KEY]
+    store.fetch(KEY, other_disk / "fetched")
+    assert (other_disk / "fetched").read_bytes() == CONTENT
+
+
+def test_a_copy_to_another_disk_says_which_of_the_two_is_missing(tmp_path: Path, other_disk: Path) -> None:
+    store = ArtifactStore(settings_of(tmp_path / "data"))
+    put(store, tmp_path / "scratch", CONTENT, KEY)
+    with pytest.raises(FileNotFoundError) as raised:
+        store.fetch(KEY, other_disk / "no folder" / "x")
+    assert not isinstance(raised.value, artifacts.ObjectMissingError)
+    with pytest.raises(artifacts.ObjectMissingError):
+        store.fetch("blobs/never", other_disk / "x")
+    assert list(other_disk.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:

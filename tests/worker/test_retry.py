@@ -20,10 +20,12 @@ from service.domain import checkpoints, jobs
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf
 from service.storage.artifacts import ArtifactStore
 from service.storage.blob_writer import StoredFile, file_sha256, store_file
+from service.storage.process_folder import process_folder
 from tests.helpers.service_world import World, wait_until
 from worker.checkpoints import CheckpointKeeper
 from worker.job_execution import Runner
 from worker.retry import may_pass, watched
+from worker.termination import StopReason, StopRequest
 
 SHELF = "0" * 64
 REFUSED = GenericError("connection refused")
@@ -208,6 +210,36 @@ def test_lost_checkpoint(world: World, brief_drive: Path, tmp_path: Path) -> Non
         assert session.get_one(Project, world.project_id).used_bytes == used_bytes + len(b"the matches")
     assert keep(world, shelf, "features.npz", b"features").key != lost.key
     assert sorted(restore("second")) == ["features.npz", "matches.npz"]
+
+
+def test_stop_while_finished_stages_are_restored(world: World, brief_drive: Path) -> None:
+    """The copy ends after the attempt's folder is gone: its stages are in the store, and another attempt finds them."""
+    shelf = DriveShelf(world.add_drive(brief_drive), SHELF)
+    names = ["features.npz", "matches.npz"]
+    stored = [keep(world, shelf, name, name.encode()) for name in names]
+    copies, go_on = threading.Event(), threading.Event()
+    threads: list[threading.Thread] = []
+
+    def fetch(key: str, target: Path) -> None:
+        threads.append(threading.current_thread())
+        copies.set()
+        go_on.wait(60)
+        world.artifacts.fetch(key, target)
+
+    def check_stop() -> None:
+        if copies.is_set():
+            raise StopRequest(StopReason.SHUT_DOWN)
+
+    with pytest.raises(StopRequest), process_folder(world.settings.scratch_dir, "job_stopped.1") as root:
+        watched(lambda: checkpoints.restore(world.database, shelf, root / "scene", fetch=fetch), check_stop)
+    go_on.set()
+    threads[0].join(60)
+    with world.database.read() as session:
+        assert sorted(row.name for row in session.query(Checkpoint)) == names
+        assert all(session.query(Blob).filter_by(key=file.key).count() == 1 for file in stored)
+    with process_folder(world.settings.scratch_dir, "job_stopped.2") as root:
+        brought = checkpoints.restore(world.database, shelf, root / "scene", fetch=world.artifacts.fetch)
+        assert sorted(brought) == names
 
 
 def test_checkpoint_that_cannot_be_kept(
