@@ -127,6 +127,7 @@ class Reconciler:
             counts = self._clock_guard.counts(clock_us(session))
             lost = jobs.expire_leases(session, limits=self._limits, only_ended=not counts)
             jobs.bound_times(session, lease_us=int(chosen.lease_seconds * 1e6), delay_us=int(longest_delay_s * 1e6))
+            webhooks.bound_times(session)
         return lost
 
     def _send(self, missing: list[Job]) -> None:

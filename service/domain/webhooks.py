@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from http import HTTPStatus
 from typing import Any
 
-from sqlalchemy import ColumnElement, Select, delete, func, select, update
+from sqlalchemy import BigInteger, ColumnElement, Select, case, delete, func, literal, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
@@ -39,6 +39,7 @@ TAKEN_US = 45 * 1_000_000  # how long a message is one sender's, who gives up ea
 KEPT_US = 30 * 24 * 3600 * 1_000_000  # how long a message is listed after its end
 # Seconds from one try to the next, as Standard Webhooks proposes; after the last it is given up: 75 hours in all.
 DELAYS_S = (5, 300, 1800, 7200, 18_000, 36_000, 50_400, 72_000, 86_400)
+_SPREAD = 1.2  # a wait is up to so many times as long: many do not come back at one moment
 _ERROR_CHARACTERS = 300
 _EVENTS = {
     JobState.SUCCEEDED: WebhookEvent.JOB_SUCCEEDED,
@@ -300,7 +301,7 @@ def note(session: Session, message: Message, outcome: Outcome) -> None:
     elif gone or message.attempts > len(DELAYS_S):
         values |= {"state": DeliveryState.FAILED}
     else:
-        delay_s = DELAYS_S[message.attempts - 1] * random.uniform(1.0, 1.2)  # many do not come back at one moment
+        delay_s = DELAYS_S[message.attempts - 1] * random.uniform(1.0, _SPREAD)
         values |= {"next_us": now + int(delay_s * 1e6)}
     mine = (WebhookDelivery.id == message.id) & (WebhookDelivery.attempts == message.attempts)
     session.execute(
@@ -316,6 +317,30 @@ def _disable(session: Session, message: Message, now: int) -> None:
         update(WebhookDelivery)
         .where(others, WebhookDelivery.state == DeliveryState.PENDING)
         .values(state=DeliveryState.FAILED, error="the address answered 410 to another message", next_us=now)
+    )
+
+
+def bound_times(session: Session) -> None:
+    """Shorten waits of messages that end later than any that begins now: the clock was set back since they began."""
+    now = clock_us(session)
+    waits_us = _longest_wait_us()
+    is_late = (WebhookDelivery.next_us > now) & (WebhookDelivery.next_us > now + waits_us)  # the first has an index
+    pending = WebhookDelivery.state == DeliveryState.PENDING
+    # One that changes at this moment is not waited for: its new time is no longer than it should be.
+    late = select(WebhookDelivery.id).where(pending, is_late).with_for_update(skip_locked=True)
+    shorter = update(WebhookDelivery).where(WebhookDelivery.id.in_(late)).values(next_us=now + waits_us)
+    session.execute(shorter.execution_options(synchronize_session=False))
+
+
+def _longest_wait_us() -> ColumnElement[int]:
+    """The longest wait of a message after as many attempts: for its next one, or for the end of the one under way."""
+    waits_us = {0: 0} | {
+        attempts: max(TAKEN_US, int(delay_s * _SPREAD * 1e6)) for attempts, delay_s in enumerate(DELAYS_S, 1)
+    }
+    return case(
+        {attempts: literal(wait_us, BigInteger) for attempts, wait_us in waits_us.items()},
+        value=WebhookDelivery.attempts,
+        else_=literal(TAKEN_US, BigInteger),
     )
 
 

@@ -251,6 +251,41 @@ def test_messages_are_taken_once_in_every_database(database: Database, project_i
         assert not webhooks.is_any_due(session)
 
 
+@pytest.mark.parametrize(("attempts", "most_s"), [(0, 0), (1, 45), (2, 360), (9, 103_680), (10, 45)])
+def test_waits_that_the_clock_made_long(database: Database, project_id: str, attempts: int, most_s: int) -> None:
+    """No message waits longer than one that begins to wait now, after as many attempts."""
+    new_webhook(database, project_id)
+    late, on_time, ended = (ended_job(database, project_id) for _ in range(3))
+    before_us, week_us, second_us = now_us(), 7 * 86_400_000_000, 1_000_000
+    ends = {late: before_us + week_us, on_time: before_us + most_s * second_us - second_us, ended: before_us + week_us}
+    with database.write() as session:
+        for message in session.query(WebhookDelivery):
+            message.attempts, message.next_us = attempts, ends[message.job_id]
+            message.state = "DELIVERED" if message.job_id == ended else "PENDING"
+    with database.write() as session:
+        webhooks.bound_times(session)
+    with database.read() as session:
+        found = {message.job_id: message.next_us for message in session.query(WebhookDelivery)}
+    assert before_us <= found[late] - most_s * second_us <= now_us()
+    assert (found[on_time], found[ended]) == (ends[on_time], ends[ended])
+
+
+def test_a_message_that_another_holds_is_not_waited_for(database: Database, project_id: str) -> None:
+    if database.engine.dialect.name == "sqlite":
+        pytest.skip("its writers take turns")
+    new_webhook(database, project_id)
+    for _ in range(2):
+        ended_job(database, project_id)
+    with database.write() as session:
+        session.query(WebhookDelivery).update({"next_us": now_us() + 86_400_000_000})
+    with database.write() as other:
+        held = other.query(WebhookDelivery).limit(1).with_for_update().one()
+        with database.write() as session:
+            webhooks.bound_times(session)
+            free = session.query(WebhookDelivery).filter(WebhookDelivery.id != held.id).one()
+            assert free.next_us <= now_us()
+
+
 def test_a_webhook_that_is_slow_holds_up_neither_others_nor_other_projects(
     database: Database, database_settings: Settings, project_id: str
 ) -> None:

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 import service.database.connections
-from service.database.tables import now_us
-from service.domain import jobs
+from schemas.api.jobs import JobKind
+from schemas.api.webhooks import WebhookRequest
+from service.database.tables import WebhookDelivery, now_us
+from service.domain import jobs, webhooks
 from tests.helpers.service_world import World
 from worker.clock_guard import ClockGuard
 from worker.heartbeat import Heartbeat
@@ -131,6 +133,32 @@ def test_wait_that_the_clock_made_long(world: World, brief_drive: Path) -> None:
         session.get_one(type(world.job(job_id)), job_id).not_before_us = now_us() + day_us
     Reconciler(world.settings).reconcile_jobs()
     assert world.job(job_id).not_before_us <= now_us() + 120_000_000
+
+
+def test_messages_that_wait_when_the_clock_is_set_back(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new one is sent at once, and one that was refused is tried again as soon as it would have been."""
+    off_us = 3_600_000_000
+    monkeypatch.setattr(service.database.connections, "now_us", lambda: now_us() + off_us)
+    asked = WebhookRequest.model_validate({"url": "http://127.0.0.1:1/hook"})
+    with world.database.write() as session:
+        webhooks.create(session, project_id=world.project_id, asked=asked, allow_private=True)
+    end_job(world)
+    with world.database.write() as session:
+        (refused,) = webhooks.take(session, limit=1)
+        webhooks.note(session, refused, webhooks.Outcome(status=500, error="answered 500"))
+    end_job(world)
+    off_us = 0
+    Reconciler(world.settings).reconcile_jobs()
+    with world.database.write() as session:
+        (fresh,) = webhooks.take(session, limit=1)
+        assert fresh.id != refused.id
+        assert session.get_one(WebhookDelivery, refused.id).next_us <= now_us() + webhooks.TAKEN_US
+
+
+def end_job(world: World) -> None:
+    with world.database.write() as session:
+        job = jobs.create(session, project_id=world.project_id, kind=JobKind.RECONSTRUCTION, drive_id="drv_1")
+        jobs.request_cancel(session, job.id)
 
 
 def test_database_that_is_locked_for_longer_than_a_lease(world: World, brief_drive: Path) -> None:
