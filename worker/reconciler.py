@@ -168,7 +168,7 @@ class Reconciler:
         self._in_batches(lambda session: _delete_some(session, unkept, IdempotencyKey.project_id, IdempotencyKey.key))
         with self._database.write() as session:
             webhooks.forget_old_secrets(session)
-            workers.forget(session, unseen_since_us=now - 30 * 24 * _HOUR_US)
+            workers.forget(session, unseen_since_us=clock_us(session) - 30 * 24 * _HOUR_US)
 
     def _in_batches(self, step: Callable[[Session], int]) -> None:
         """Repeat a transaction until it deletes nothing any more."""

@@ -14,8 +14,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
 from schemas.api.webhooks import DeliveryState
-from service.database.connections import Database
-from service.database.tables import Job, JobState, Project, WebhookDelivery, WorkerSeen, now_us
+from service.database.connections import Database, clock_us
+from service.database.tables import Job, JobState, Project, WebhookDelivery, WorkerSeen
 from service.domain.workers import ONLINE_US
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -80,7 +80,7 @@ class _Records(Collector):
     def _counts(self) -> tuple[dict[str, int], dict[str, int], int, int]:
         with self._database.read() as session:
             states, messages = _by_state(session, Job.state), _by_state(session, WebhookDelivery.state)
-            seen = WorkerSeen.seen_us > now_us() - ONLINE_US
+            seen = WorkerSeen.seen_us > clock_us(session) - ONLINE_US
             workers = session.scalar(select(func.count()).select_from(WorkerSeen).where(seen)) or 0
             used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0
         return states, messages, workers, int(used)

@@ -6,9 +6,11 @@ import os
 import shutil
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -45,6 +47,17 @@ def postgres_api(tmp_path_factory: pytest.TempPathFactory, postgres_url: str) ->
         settings = settings_of(tmp_path_factory.mktemp("postgres-api"), database_url=url)
         with api_in_thread(settings) as running:
             yield running
+
+
+@pytest.fixture
+def set_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """A function that sets this process's clock so many microseconds off, as another host's; not the database's."""
+
+    def set_off(off_us: int) -> None:
+        host = SimpleNamespace(time_ns=lambda: time.time_ns() + 1000 * off_us)
+        monkeypatch.setattr("service.database.tables._base.time", host)
+
+    return set_off
 
 
 @pytest.fixture

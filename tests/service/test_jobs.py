@@ -5,18 +5,21 @@ from __future__ import annotations
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import httpx
 import pytest
+from sqlalchemy import event as engine_event
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.tables import ApiKey, Job, Project, now_us
 from service.domain import jobs
 from service.domain.keys import revoke_key
 from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
 
 LEASE_US = 60_000_000
@@ -124,6 +127,44 @@ def test_a_silent_job_is_shown_as_stalled(owner: Client, job: dict[str, Any]) ->
     stalled = owner.get(url, headers={"If-None-Match": running.headers["etag"]})
     assert stalled.json()["state"] == "STALLED"
     assert owner.get("/v1/status").json()["queue"]["stalled"] >= 1
+
+
+@pytest.mark.parametrize("off_us", [3_600_000_000, -3_600_000_000])
+def test_a_job_stalls_by_the_database_s_clock(postgres_api: Api, set_clock: Callable[[int], None], off_us: int) -> None:
+    """Not by that of the host that shows it."""
+    client = postgres_api.client()
+    drive_id = client.frozen(tiny_drive("clock", seed=str(off_us)))
+    silent, alive = (client.reconstruct(drive_id, **{"Idempotency-Key": key})["id"] for key in "ab")
+    for job_id in (silent, alive):
+        client.claim(job_id)
+    with postgres_api.database.write() as session:
+        session.get_one(Job, silent).heartbeat_us = now_us() - 600_000_000
+
+    def count_stalled() -> int:
+        return int(client.get("/v1/status").json()["queue"]["stalled"])
+
+    before = count_stalled()
+    set_clock(off_us)
+    with statements_of(postgres_api) as statements:
+        states = {job["id"]: job["state"] for job in client.get("/v1/jobs").json()["items"]}
+    assert (states[silent], states[alive]) == ("STALLED", "RUNNING")
+    assert sum("clock_timestamp" in statement for statement in statements) == 1, "one look at the clock for all jobs"
+    counted = count_stalled()
+    set_clock(0)
+    assert before <= counted <= count_stalled(), "jobs of others may stall meanwhile"
+
+
+@contextmanager
+def statements_of(api: Api) -> Iterator[list[str]]:
+    """What the API asks its database."""
+    engine, statements = api.context.database.engine, list[str]()
+
+    def executed(connection: Any, cursor: Any, statement: str, *_: object) -> None:
+        statements.append(statement)
+
+    engine_event.listen(engine, "after_cursor_execute", executed)
+    yield statements
+    engine_event.remove(engine, "after_cursor_execute", executed)
 
 
 def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:

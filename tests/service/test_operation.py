@@ -8,7 +8,7 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -18,6 +18,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from sqlalchemy import event, text
 
 from service.api.routes import drives as drive_routes
+from service.database.tables import WorkerSeen
 from service.domain import workers
 from service.logs import JsonFormatter, log_fields
 from service.settings import Settings
@@ -145,6 +146,33 @@ def test_the_status_says_what_is_missing_and_what_that_means(api: Api, client: C
     (worker,) = (worker for worker in shown["workers"] if worker["name"] == "w@test")
     assert worker["online"] is True
     assert not any("no worker" in reason for reason in shown["reasons"])
+
+
+@pytest.mark.parametrize("off_us", [3_600_000_000, -3_600_000_000])
+def test_workers_are_seen_by_the_database_s_clock(
+    postgres_api: Api, set_clock: Callable[[int], None], off_us: int
+) -> None:
+    """The clock of a worker's host is off, and then that of the host that looks."""
+    gone, here = f"gone{off_us}@test", f"here{off_us}@test"
+    with postgres_api.database.write() as session:
+        workers.report(session, name=gone, queues=["checks"], concurrency=1)
+        session.get_one(WorkerSeen, gone).seen_us -= 600_000_000
+        before = workers.count_processes(session, "checks")
+    online = metrics_of(postgres_api)["mrasfm_workers_online{}"]
+    for of_worker, of_api in ((off_us, 0), (0, off_us)):
+        set_clock(of_worker)
+        for _ in range(2):  # a new one, and one that is known
+            with postgres_api.database.write() as session:
+                workers.report(session, name=here, queues=["checks"], concurrency=2)
+        set_clock(of_api)
+        shown = {worker["name"]: worker for worker in postgres_api.client().get("/v1/status").json()["workers"]}
+        assert (shown[gone]["online"], shown[here]["online"]) == (False, True)
+        assert metrics_of(postgres_api)["mrasfm_workers_online{}"] == online + 1
+        with postgres_api.database.read() as session:
+            assert workers.count_processes(session, "checks") == before + 2
+            assert abs(session.get_one(WorkerSeen, here).seen_us - time.time_ns() // 1000) < 60_000_000
+        with postgres_api.database.write() as session:
+            session.delete(session.get_one(WorkerSeen, here))
 
 
 def test_a_log_line_is_one_json_object_with_its_fields() -> None:

@@ -16,7 +16,7 @@ from service.api.context import Context
 from service.api.credentials import secret_of
 from service.api.dependencies import CallerDep, ContextDep, LastEventId, StreamDep
 from service.api.http.responses import gives, problems
-from service.api.routes.job_views import views_of
+from service.api.routes.job_views import stalled_before_us, views_of
 from service.database.tables import Job, JobEvent, JobMember, JobState, now_us
 from service.domain.keys import KeyRing
 
@@ -97,7 +97,7 @@ class _Reader:
 
     def _changed(self, session: Session, position: _Position) -> set[str]:
         changed = self._with_events(session, position)
-        silent = Job.heartbeat_us < now_us() - int(self.context.settings.stalled_seconds * 1e6)
+        silent = Job.heartbeat_us < stalled_before_us(session, self.context.settings)
         running = select(Job.id).where(Job.project_id == self.project_id, Job.state == JobState.RUNNING, silent)
         stalled = frozenset(session.scalars(running))
         changed |= stalled ^ position.stalled

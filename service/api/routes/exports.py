@@ -19,7 +19,7 @@ from service.api.http.paging import newest
 from service.api.http.request_bodies import Body, describe
 from service.api.http.responses import gives, problems
 from service.api.routes.downloads import download_route, files_of, find_file, send_file
-from service.api.routes.job_views import RETRY_AFTER_S, shown_state
+from service.api.routes.job_views import RETRY_AFTER_S, shown_state, stalled_before_us
 from service.database.tables import Blob, Export, ExportFile, Job, MapVersion, Scene, now_us
 from service.domain import exports, maps
 from service.domain.access import require
@@ -187,21 +187,22 @@ def _listed(session: Session, found: Sequence[Export], settings: Settings) -> li
     """Exports without their files."""
     of_jobs = select(Job).where(Job.id.in_([export.job_id for export in found]))
     by_id = {job.id: job for job in session.scalars(of_jobs)}
-    return [_resource(export, by_id.get(export.job_id), [], settings) for export in found]
+    stalled_us = stalled_before_us(session, settings)
+    return [_resource(export, by_id.get(export.job_id), [], stalled_us) for export in found]
 
 
 def _shown(session: Session, export: Export, settings: Settings) -> ExportResource:
     """One export with its files."""
     mine, url = ExportFile.export_id == export.id, f"/v1/exports/{export.id}"
     files = files_of(session, ExportFile, mine, ExportFileResource, url)
-    return _resource(export, session.get(Job, export.job_id), files, settings)
+    return _resource(export, session.get(Job, export.job_id), files, stalled_before_us(session, settings))
 
 
-def _resource(export: Export, job: Job | None, files: list[ExportFileResource], settings: Settings) -> ExportResource:
+def _resource(export: Export, job: Job | None, files: list[ExportFileResource], stalled_us: int) -> ExportResource:
     if export.results is not None:
         state = JobState.SUCCEEDED
     else:
-        state = JobState.FAILED if job is None else shown_state(job, settings)
+        state = JobState.FAILED if job is None else shown_state(job, stalled_us)
     return ExportResource.model_validate(
         {
             "id": export.id,

@@ -14,17 +14,25 @@ from schemas.api.jobs import JobMember as MemberResource
 from schemas.api.jobs import JobState as ShownState
 from schemas.api.jobs import JobSubmap as SubmapResource
 from service.api.dependencies import moment
-from service.database.tables import Job, JobAttempt, JobMember, JobState, now_us
+from service.database.connections import clock_us
+from service.database.tables import Job, JobAttempt, JobMember, JobState
 from service.domain import jobs
 from service.settings import Settings
 
 RETRY_AFTER_S = 2
 
 
-def shown_state(job: Job, settings: Settings) -> ShownState:
-    """The job's state; STALLED where it runs and has not been heard of for a while."""
-    silent_us = now_us() - (job.heartbeat_us or 0)
-    if job.state == JobState.RUNNING and silent_us > settings.stalled_seconds * 1e6:
+def stalled_before_us(session: Session, settings: Settings) -> int:
+    """The time of the oldest heartbeat with which a running job is not stalled, on the clock of the heartbeats.
+
+    Asked once for all jobs of an answer: the clock is the database's.
+    """
+    return clock_us(session) - int(settings.stalled_seconds * 1e6)
+
+
+def shown_state(job: Job, stalled_us: int) -> ShownState:
+    """The job's state; STALLED where it runs and was last heard of before a time, see `stalled_before_us`."""
+    if job.state == JobState.RUNNING and (job.heartbeat_us or 0) < stalled_us:
         return ShownState.STALLED
     return ShownState(job.state)
 
@@ -46,8 +54,9 @@ def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list
     members = jobs.members_of(session, trees) if trees else {}
     planned = [job.id for job in found if job.kind == JobKind.RECONSTRUCTION and job.children_percent]
     submaps = jobs.submaps_of(session, planned) if planned else {}
+    stalled_us = stalled_before_us(session, settings)
     return [
-        _shown(job, attempts.get(job.id, ()), members.get(job.id, ()), submaps.get(job.id, ()), settings)
+        _shown(job, attempts.get(job.id, ()), members.get(job.id, ()), submaps.get(job.id, ()), stalled_us)
         for job in found
     ]
 
@@ -62,14 +71,14 @@ def _shown(
     attempts: Sequence[JobAttempt],
     members: Sequence[tuple[JobMember, Job | None]],
     submaps: Sequence[Job],
-    settings: Settings,
+    stalled_us: int,
 ) -> JobResource:
     return JobResource.model_validate(
         {
             "id": job.id,
             "kind": job.kind,
             "drive_id": job.drive_id,
-            "state": shown_state(job, settings),
+            "state": shown_state(job, stalled_us),
             "settings": job.settings,
             "progress": JobProgress(
                 stage=job.stage,
@@ -89,10 +98,10 @@ def _shown(
             "map_id": job.map_id,
             "map_version": job.map_version,
             "export_id": (job.request or {}).get("export_id") if job.kind == JobKind.EXPORT else None,
-            "members": [_shown_member(member, child, settings) for member, child in members],
+            "members": [_shown_member(member, child, stalled_us) for member, child in members],
             "parent_id": job.parent_id,
             "submap": None if job.parent_id is None else jobs.number_of(job),
-            "submaps": [_shown_submap(submap, settings) for submap in submaps],
+            "submaps": [_shown_submap(submap, stalled_us) for submap in submaps],
             "retry_of": job.retry_of,
             "created_at": moment(job.created_us),
             "started_at": moment(job.started_us),
@@ -115,14 +124,14 @@ def _shown_attempt(attempt: JobAttempt) -> AttemptResource:
     )
 
 
-def _shown_member(member: JobMember, child: Job | None, settings: Settings) -> MemberResource:
+def _shown_member(member: JobMember, child: Job | None, stalled_us: int) -> MemberResource:
     is_there = member.scene_id is not None
     return MemberResource.model_validate(
         {
             "name": member.name,
             "drive_id": member.drive_id,
             "job_id": member.child_id,
-            "state": None if child is None else shown_state(child, settings),
+            "state": None if child is None else shown_state(child, stalled_us),
             "percent": 100.0 if is_there or child is None else child.percent,
             "scene_id": member.scene_id,
             "problem": member.problem,
@@ -130,7 +139,7 @@ def _shown_member(member: JobMember, child: Job | None, settings: Settings) -> M
     )
 
 
-def _shown_submap(submap: Job, settings: Settings) -> SubmapResource:
+def _shown_submap(submap: Job, stalled_us: int) -> SubmapResource:
     place = submap.request or {}
     return SubmapResource.model_validate(
         {
@@ -138,7 +147,7 @@ def _shown_submap(submap: Job, settings: Settings) -> SubmapResource:
             "job_id": submap.id,
             "first_unit": place["first_unit"],
             "last_unit": place["last_unit"],
-            "state": shown_state(submap, settings),
+            "state": shown_state(submap, stalled_us),
             "percent": submap.percent,
             "problem": submap.problem,
         }

@@ -19,7 +19,9 @@ from service.api.dependencies import CallerDep, ContextDep, moment
 from service.api.http.responses import gives, problems
 from service.api.metrics import CONTENT_TYPE, Metrics
 from service.api.readiness import Readiness
-from service.database.tables import Job, JobState, WorkerSeen, now_us
+from service.api.routes.job_views import stalled_before_us
+from service.database.connections import clock_us
+from service.database.tables import Job, JobState, WorkerSeen
 from service.domain.workers import ONLINE_US
 from service.errors import Unauthorized
 from service.job_queue import QUEUES, BrokerError
@@ -74,7 +76,7 @@ def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
 
 
 def _workers(session: Session) -> list[WorkerStatus]:
-    now = now_us()
+    now = clock_us(session)
     rows = session.scalars(
         select(WorkerSeen).where(WorkerSeen.seen_us > now - 86_400_000_000).order_by(WorkerSeen.name)
     )
@@ -93,7 +95,7 @@ def _workers(session: Session) -> list[WorkerStatus]:
 
 
 def _queue(session: Session, context: Context) -> QueueStatus:
-    silent = Job.heartbeat_us < now_us() - int(context.settings.stalled_seconds * 1e6)
+    silent = Job.heartbeat_us < stalled_before_us(session, context.settings)
     by_state = select(Job.state, func.count()).group_by(Job.state)
     counts: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
     stalled = select(func.count()).select_from(Job).where(Job.state == JobState.RUNNING, silent)
