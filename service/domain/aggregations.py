@@ -106,6 +106,7 @@ def create(
         settings=settings,
         retry_of=None if retry_of is None else retry_of.id,
         expires_us=job_expires_us,
+        has_place=True,
         map_id=of_map.id,
         request={
             "asked": asked.model_dump(mode="json", exclude_none=True),
@@ -288,6 +289,7 @@ def _child(session: Session, drive: Drive, job: Job) -> Job:
         drive_id=drive.id,
         settings=job.settings,
         expires_us=job.expires_us,
+        has_place=True,
         is_child=True,
     )
 

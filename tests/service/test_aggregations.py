@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import delete, update
+from sqlalchemy import delete, event, update
 
 from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -358,6 +358,22 @@ def test_the_quota_of_jobs_counts_the_whole_tree(api: Api) -> None:
     job = client.aggregate(**asked)
     assert [member["job_id"] for member in job["members"]][:2] == [None, second]
     problem_of(client.post("/v1/reconstructions", json={"drive_id": drives[0]}), 429, "too-many-jobs")
+
+
+def test_active_jobs_are_counted_once_for_the_whole_tree(api: Api, client: Client, drives: list[str]) -> None:
+    statements: list[str] = []
+
+    def executed(connection: Any, cursor: Any, statement: str, *given: Any) -> None:
+        statements.append(statement)
+
+    engine = api.context.database.engine
+    event.listen(engine, "after_cursor_execute", executed)
+    try:
+        client.aggregate(drives=drives)
+    finally:
+        event.remove(engine, "after_cursor_execute", executed)
+    counts = [each for each in statements if "count(*)" in each and "jobs.project_id" in each]
+    assert len(counts) == 1
 
 
 def test_drives_of_one_name(client: Client) -> None:

@@ -13,13 +13,16 @@ from typing import Any
 import httpx
 import pytest
 from sqlalchemy import event as engine_event
+from sqlalchemy import insert
 
+from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.database.tables import ApiKey, Job, Project, now_us
+from service.database.tables import ApiKey, Job, Project, new_id, now_us
 from service.domain import jobs
 from service.domain.keys import revoke_key
 from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
+from tests.helpers.sqlite_steps import sqlite_steps
 from tests.service.conftest import StartApi
 
 LEASE_US = 60_000_000
@@ -285,6 +288,18 @@ def test_the_quota_of_jobs(api: Api) -> None:
     client.post(f"/v1/jobs/{job['id']}:cancel")
     client.reconstruct(drive_id)
     problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
+
+
+def test_the_quota_of_jobs_is_counted_without_the_history(api: Api) -> None:
+    client = api.client()
+    with sqlite_steps(api.database) as new, api.database.write() as session:
+        jobs.require_places(session, client.project_id, 1)
+    with api.database.write() as session:
+        old = {"project_id": client.project_id, "kind": JobKind.RECONSTRUCTION, "state": "SUCCEEDED"}
+        session.execute(insert(Job), [{**old, "id": new_id("job"), "settings": {}} for _ in range(2000)])
+    with sqlite_steps(api.database) as later, api.database.write() as session:
+        jobs.require_places(session, client.project_id, 1)
+    assert later.count < new.count + 500, "a job of the history takes ten or more"
 
 
 def test_a_project_without_space_gets_no_jobs(api: Api) -> None:

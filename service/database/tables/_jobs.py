@@ -31,6 +31,8 @@ class Job(Base):
     __table_args__ = (
         Index(None, "project_id", "created_us", "id"),
         Index(None, "state", "lease_until_us"),
+        # The quota counts active jobs. Not a partial index: SQLite uses none for states that are given as parameters.
+        Index(None, "project_id", "state", "kind"),
     )
 
     id: Mapped[str] = mapped_column(Id, primary_key=True, default=lambda: new_id("job"))

@@ -51,6 +51,7 @@ def create(
     settings: Mapping[str, Any] | None = None,
     retry_of: str | None = None,
     expires_us: int | None = None,
+    has_place: bool = False,
     **of_tree: Unpack[OfTree],
 ) -> Job:
     """Record a new job; it exists once the session commits.
@@ -59,6 +60,9 @@ def create(
     ----------
     drive_id
         None for an aggregation, which has a map.
+    has_place
+        Whether this transaction has asked `require_places` for it, together with others: all that is active would
+        else be counted anew for each of them.
     of_tree
         Of a job that waits for others, and of a job that another one needs.
 
@@ -67,7 +71,7 @@ def create(
     ServiceError
         429 where the project has as many active jobs as its quota allows, 413 where it has no space left.
     """
-    if kind not in _UNCOUNTED:
+    if kind not in _UNCOUNTED and not has_place:
         require_places(session, project_id, 1)
     job = Job(
         id=new_id("job"),
