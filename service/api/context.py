@@ -14,6 +14,7 @@ from service.domain.request_holds import HoldKeeper
 from service.job_queue import JobQueue
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
+from service.storage.garbage_collection import Collector
 from service.storage.uploads.archive_watch import KeptWatches
 
 _LARGE_BODIES = 4
@@ -32,6 +33,7 @@ class Context:
     keys: KeyRing
     holds: HoldKeeper
     artifacts: ArtifactStore
+    collector: Collector
     job_queue: JobQueue
     disk: anyio.CapacityLimiter  # uploads that write at one time
     large_bodies: FairPlaces  # JSON bodies that are in memory at one time
@@ -45,13 +47,14 @@ class Context:
     @classmethod
     def open(cls, settings: Settings) -> Context:
         """Open everything that the settings name; the broker is not asked."""
-        database = Database.from_settings(settings)
+        database, artifacts = Database.from_settings(settings), ArtifactStore(settings)
         return cls(
             settings=settings,
             database=database,
             keys=KeyRing(database),
             holds=HoldKeeper(database),
-            artifacts=ArtifactStore(settings),
+            artifacts=artifacts,
+            collector=Collector(database, artifacts),
             job_queue=JobQueue(settings),
             disk=anyio.CapacityLimiter(settings.max_concurrent_writes),
             large_bodies=FairPlaces(
@@ -66,4 +69,5 @@ class Context:
     def close(self) -> None:
         """Give back what was opened."""
         self.holds.close()
+        self.collector.close()
         self.database.close()

@@ -20,8 +20,9 @@ from service.domain.access import require
 from service.domain.manifest_facts import ManifestFacts
 from service.domain.maps import require_unused
 from service.errors import DriveChanging, DriveIncomplete, DriveInUse, TooManyDrives
-from service.storage import blobs, durability
+from service.storage import blobs, durability, named_blobs
 from service.storage.blob_writer import StoredFile
+from service.storage.named_blobs import Named
 
 _SHOWN = 1000  # of missing files, in an answer
 _BATCH = 500
@@ -274,8 +275,13 @@ def commit(
     return job
 
 
-def remove(session: Session, project_id: str, drive_id: str) -> None:
+def remove(session: Session, project_id: str, drive_id: str) -> Named:
     """Delete a drive. Its scenes stay; bytes that nothing else needs are collected later.
+
+    Returns
+    -------
+    Named
+        Blobs that it named.
 
     Raises
     ------
@@ -298,4 +304,6 @@ def remove(session: Session, project_id: str, drive_id: str) -> None:
     require_unused(session, what=f"drive {drive.id}", drive_id=drive.id)
     for job in active:
         jobs.request_cancel(session, job.id)
+    named = named_blobs.of_drive(session, drive.id)
     session.execute(delete(Drive).where(Drive.id == drive.id))
+    return named

@@ -26,8 +26,9 @@ from service.domain import jobs
 from service.domain.export_inputs import ExportInputs, drive_deleted
 from service.domain.scenes import media_type
 from service.errors import ExportActive, ExportDeleted, UsedByJob
-from service.storage import blobs
+from service.storage import blobs, named_blobs
 from service.storage.blob_writer import StoredFile
+from service.storage.named_blobs import Named
 
 
 class ExportGoneError(Exception):
@@ -153,8 +154,13 @@ def publish(
     return export_id
 
 
-def remove(session: Session, export: Export) -> None:
+def remove(session: Session, export: Export) -> Named:
     """Delete an export, which the caller has locked.
+
+    Returns
+    -------
+    Named
+        Blobs that it named.
 
     Raises
     ------
@@ -167,7 +173,9 @@ def remove(session: Session, export: Export) -> None:
             f"job {job.id} is making export {export.id}",
             remedy="Wait for its end, or cancel it.",
         )
+    named = named_blobs.of_export(session, export.id)
     session.execute(delete(Export).where(Export.id == export.id))
+    return named
 
 
 def require_none_active(session: Session, *, what: str, mine: ColumnElement[bool]) -> None:

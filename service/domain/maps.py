@@ -15,8 +15,9 @@ from service.domain import jobs
 from service.domain.access import require
 from service.domain.scenes import media_type
 from service.errors import MapBusy, UsedByJob, UsedByMap, VersionCurrent, not_found
-from service.storage import blobs
+from service.storage import blobs, named_blobs
 from service.storage.blob_writer import StoredFile
+from service.storage.named_blobs import Named
 
 
 def get(session: Session, project_id: str, map_id: str, *, lock: bool = False) -> Map:
@@ -170,8 +171,13 @@ def show_version(session: Session, found: Map, number: int) -> None:
     found.current_version = number
 
 
-def remove(session: Session, found: Map) -> None:
+def remove(session: Session, found: Map) -> Named:
     """Delete a map with all its versions. Its scenes stay.
+
+    Returns
+    -------
+    Named
+        Blobs that it named.
 
     Raises
     ------
@@ -179,11 +185,18 @@ def remove(session: Session, found: Map) -> None:
         409 while an aggregation makes a version of it.
     """
     require_idle(session, found)
+    named_by_it = named_blobs.of_map(session, found.id)
     session.execute(delete(Map).where(Map.id == found.id))
+    return named_by_it
 
 
-def remove_version(session: Session, found: Map, number: str) -> None:
+def remove_version(session: Session, found: Map, number: str) -> Named:
     """Delete a version that is not the current one.
+
+    Returns
+    -------
+    Named
+        Blobs that it named.
 
     Raises
     ------
@@ -197,7 +210,9 @@ def remove_version(session: Session, found: Map, number: str) -> None:
             f"version {version.number} is the current one of map {found.id}",
             remedy="Make another version the current one first, or delete the map.",
         )
+    named_by_it = named_blobs.of_version(session, found.id, version.number)
     session.execute(delete(MapVersion).where(MapVersion.map_id == found.id, MapVersion.number == version.number))
+    return named_by_it
 
 
 def require_unused(session: Session, *, what: str, drive_id: str | None = None, scene_id: str | None = None) -> None:

@@ -251,6 +251,11 @@ def find_unused(
     return list(session.scalars(page.order_by(Blob.sha256).limit(limit)))
 
 
+def unused_among(session: Session, blob_ids: Sequence[str], *, untouched_since_us: int) -> list[str]:
+    """Ids of some hundred blobs that nothing refers to; what `forget_unused` may be given."""
+    return list(session.scalars(select(Blob.id).where(Blob.id.in_(blob_ids), _ripe(untouched_since_us))))
+
+
 def forget_unused(session: Session, *, untouched_since_us: int, blob_ids: Sequence[str] | None = None) -> list[str]:
     """Drop blobs that nothing refers to, and give their space back to their projects.
 

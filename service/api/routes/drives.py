@@ -6,7 +6,7 @@ from functools import partial
 from typing import Annotated
 
 import anyio.to_thread
-from fastapi import APIRouter, BackgroundTasks, Depends, Query, Response
+from fastapi import APIRouter, Depends, Query, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
@@ -29,7 +29,6 @@ from service.domain.manifest_facts import ManifestFacts
 from service.errors import drive_rejected
 from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.durability import secure_drive
-from service.storage.garbage_collection import collect_unused
 from service.storage.spool import SpoolWriter
 
 router = APIRouter(prefix="/v1/drives", tags=["drives"])
@@ -125,13 +124,13 @@ def get_drive_manifest(drive_id: str, caller: CallerDep, context: ContextDep) ->
     summary="Delete a drive",
     responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
 )
-def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
+def delete_drive(drive_id: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete a drive and its files. Scenes that were made of it stay.
 
     Bytes that nothing else needs leave the quota at once, or an hour after they were last used.
     """
-    context.database.transact(lambda session: drives.remove(session, caller.project_id, drive_id))
-    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
+    named = context.database.transact(lambda session: drives.remove(session, caller.project_id, drive_id))
+    context.collector.add(caller.project_id, named)
 
 
 @router.post(

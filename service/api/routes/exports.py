@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Depends, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -25,7 +25,7 @@ from service.domain import exports, maps
 from service.domain.access import require
 from service.domain.idempotency import Answer
 from service.settings import Settings
-from service.storage.garbage_collection import collect_unused
+from service.storage.named_blobs import Named
 
 router = APIRouter(prefix="/v1", tags=["exports"])
 
@@ -139,14 +139,13 @@ def get_export(export_id: str, caller: CallerDep, context: ContextDep) -> Export
     summary="Delete an export",
     responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
 )
-def delete_export(export_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
+def delete_export(export_id: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete an export and its files. One that is being made is cancelled first, at its job."""
 
-    def remove(session: Session) -> None:
-        exports.remove(session, require(session, Export, caller.project_id, export_id, lock=True))
+    def remove(session: Session) -> Named:
+        return exports.remove(session, require(session, Export, caller.project_id, export_id, lock=True))
 
-    context.database.transact(remove)
-    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
+    context.collector.add(caller.project_id, context.database.transact(remove))
 
 
 @download_route(router, "/exports/{export_id}/files/{path:path}", summary="Download a file of an export")

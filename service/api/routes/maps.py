@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Depends, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
@@ -18,7 +18,7 @@ from service.api.http.responses import gives, problems
 from service.api.routes.downloads import download_route, files_of, find_file, send_file
 from service.database.tables import Blob, Export, Map, MapFile, MapScene, MapVersion
 from service.domain import exports, maps
-from service.storage.garbage_collection import collect_unused
+from service.storage.named_blobs import Named
 
 router = APIRouter(prefix="/v1/maps", tags=["maps"])
 
@@ -46,16 +46,15 @@ def get_map(map_id: str, caller: CallerDep, context: ContextDep) -> MapResource:
     summary="Delete a map",
     responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
 )
-def delete_map(map_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
+def delete_map(map_id: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete a map with all its versions. Its scenes and drives stay."""
 
-    def remove(session: Session) -> None:
+    def remove(session: Session) -> Named:
         found = maps.get(session, caller.project_id, map_id, lock=True)
         exports.require_none_active(session, what=f"map {map_id}", mine=Export.map_id == map_id)
-        maps.remove(session, found)
+        return maps.remove(session, found)
 
-    context.database.transact(remove)
-    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
+    context.collector.add(caller.project_id, context.database.transact(remove))
 
 
 @router.put(
@@ -116,20 +115,17 @@ def get_map_version(map_id: str, version: str, caller: CallerDep, context: Conte
     summary="Delete a map's version",
     responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
 )
-def delete_map_version(
-    map_id: str, version: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks
-) -> None:
+def delete_map_version(map_id: str, version: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete a version that is not the current one. Its scenes stay."""
 
-    def remove(session: Session) -> None:
+    def remove(session: Session) -> Named:
         found = maps.get(session, caller.project_id, map_id, lock=True)
         number = maps.version_of(session, found, version).number
         mine = (Export.map_id == map_id) & (Export.map_version == number)
         exports.require_none_active(session, what=f"version {number} of map {map_id}", mine=mine)
-        maps.remove_version(session, found, version)
+        return maps.remove_version(session, found, version)
 
-    context.database.transact(remove)
-    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
+    context.collector.add(caller.project_id, context.database.transact(remove))
 
 
 @download_route(router, "/{map_id}/versions/{version}/files/{path:path}", summary="Download a file of a map")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from fastapi import APIRouter, BackgroundTasks, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy import delete
 from sqlalchemy.orm import Session
 
@@ -18,7 +18,8 @@ from service.database.tables import Blob, Export, Scene, SceneFile
 from service.domain import exports
 from service.domain.access import require
 from service.domain.maps import require_unused
-from service.storage.garbage_collection import collect_unused
+from service.storage import named_blobs
+from service.storage.named_blobs import Named
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -52,17 +53,18 @@ def get_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> SceneRes
     summary="Delete a scene",
     responses={**gives(204, "Deleted"), **problems(401, 404, 409)},
 )
-def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep, background: BackgroundTasks) -> None:
+def delete_scene(scene_id: str, caller: CallerDep, context: ContextDep) -> None:
     """Delete a scene and its files. Its drive stays; what a map is made of cannot be deleted."""
 
-    def remove(session: Session) -> None:
+    def remove(session: Session) -> Named:
         require(session, Scene, caller.project_id, scene_id, lock=True)
         require_unused(session, what=f"scene {scene_id}", scene_id=scene_id)
         exports.require_none_active(session, what=f"scene {scene_id}", mine=Export.scene_id == scene_id)
+        named = named_blobs.of_scene(session, scene_id)
         session.execute(delete(Scene).where(Scene.id == scene_id))
+        return named
 
-    context.database.transact(remove)
-    background.add_task(collect_unused, context.database, context.artifacts, project_id=caller.project_id)
+    context.collector.add(caller.project_id, context.database.transact(remove))
 
 
 @download_route(router, "/{scene_id}/files/{path:path}", summary="Download a file of a scene")
