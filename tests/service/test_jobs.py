@@ -17,12 +17,13 @@ from sqlalchemy import insert
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.database.tables import ApiKey, Job, Project, new_id, now_us
+from service.api.routes import job_views
+from service.database.tables import ApiKey, Job, JobMember, Project, new_id, now_us
 from service.domain import jobs
 from service.domain.keys import revoke_key
 from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
-from tests.helpers.tiny_drive import tiny_drive
 from tests.helpers.sqlite_steps import sqlite_steps
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
 
 LEASE_US = 60_000_000
@@ -180,6 +181,65 @@ def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
     check = client.get(f"/v1/drives/{first}").json()["preflight_job_id"]
     assert [shown["id"] for shown in (*page["items"], *rest["items"])] == [*made[::-1], check]
     assert len(client.get("/v1/jobs").json()["items"]) == 6
+
+
+def _history(client: Client, *members: int) -> list[str]:
+    """Jobs that have ended, of the newest first: an aggregation of as many members each, a reconstruction for 0."""
+    common = {"project_id": client.project_id, "state": "SUCCEEDED", "settings": {}}
+    kinds = [JobKind.AGGREGATION if count else JobKind.RECONSTRUCTION for count in members]
+    trees = [{**common, "id": new_id("job"), "kind": kind, "created_us": 1000 - i} for i, kind in enumerate(kinds)]
+    children = [
+        {**common, "id": new_id("job"), "kind": JobKind.RECONSTRUCTION, "created_us": 1} for _ in range(max(members))
+    ]
+    rows = [
+        {"job_id": tree["id"], "drive_id": f"drv_{i}", "name": f"d{i}", "child_id": children[i]["id"]}
+        for tree, count in zip(trees, members, strict=True)
+        for i in range(count)
+    ]
+    with client.api.database.write() as session:
+        session.execute(insert(Job), [*trees, *children])
+        session.flush()
+        session.execute(insert(JobMember), rows)
+    return [str(tree["id"]) for tree in trees]
+
+
+def test_a_page_of_jobs_ends_where_their_members_are_many(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job_views, "CHILDREN_OF_PAGE", 10)
+    client = api.client()
+    made = _history(client, 0, 4, 4, 0, 4, 11, 12, 0)
+    pages: list[list[str]] = []
+    members: list[int] = []
+    cursor = None
+    while len(pages) < 2 or cursor is not None:
+        where = {"limit": 6, **({} if cursor is None else {"cursor": cursor})}
+        page = client.get("/v1/jobs", params=where).json()
+        pages.append([shown["id"] for shown in page["items"] if shown["id"] in made])
+        members += [len(shown["members"]) for shown in page["items"] if shown["id"] in made]
+        cursor = page["next"]
+    assert [len(page) for page in pages[:5]] == [4, 1, 1, 1, 1]
+    assert [job_id for page in pages for job_id in page] == made
+    assert members == [0, 4, 4, 0, 4, 11, 12, 0]
+
+
+def test_a_page_of_jobs_reads_no_more_than_it_shows(api: Api) -> None:
+    client = api.client()
+    _history(client, *[0] * 20, *[1500] * 3)
+    statements: list[str] = []
+
+    def executed(connection: Any, cursor: Any, statement: str, *given: Any) -> None:
+        statements.append(statement)
+
+    engine = api.context.database.engine
+    engine_event.listen(engine, "after_cursor_execute", executed)
+    try:
+        page = client.get("/v1/jobs", params={"limit": 1000}).json()
+    finally:
+        engine_event.remove(engine, "after_cursor_execute", executed)
+    assert [len(shown["members"]) for shown in page["items"]] == [*[0] * 20, 1500]
+    assert len(statements) < 12, "however many jobs and members there are"
+    of_members = [statement for statement in statements if "job_members.name" in statement]
+    assert len(of_members) == 1
+    assert "jobs.request" not in of_members[0]
 
 
 def test_cancelling_a_waiting_job_ends_it_with_no_worker(owner: Client, job: dict[str, Any]) -> None:
@@ -411,8 +471,8 @@ def test_events_tell_the_whole_story_and_go_on_where_a_reader_stopped(owner: Cli
     assert events[-1]["data"]["scene_id"] == scene_id
     ids = [int(event["id"]) for event in events]
     assert ids == sorted(set(ids))
-    for i, event in enumerate(events):
-        assert read_all(owner, job["id"], **{"Last-Event-ID": event["id"]}) == events[i + 1 :]
+    for i, seen in enumerate(events):
+        assert read_all(owner, job["id"], **{"Last-Event-ID": seen["id"]}) == events[i + 1 :]
 
 
 def test_a_reader_goes_on_after_progress_that_is_not_kept(owner: Client, job: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, TypeVar
 
 from sqlalchemy import Row, Select, select, tuple_
-from sqlalchemy.orm import InstrumentedAttribute, Session
+from sqlalchemy.orm import InstrumentedAttribute, Session, load_only
 
 from schemas.drive import MAX_PATH_CHARACTERS
 from service.database.tables import Drive, Export, Job, Map, Scene, Webhook
@@ -61,13 +61,33 @@ def page_of(
 
 
 def newest(
-    session: Session, table: type[Paged], project_id: str, *, cursor: str | None, limit: int, **where: Any
+    session: Session,
+    table: type[Paged],
+    project_id: str,
+    *,
+    cursor: str | None,
+    limit: int,
+    places_only: bool = False,
+    **where: Any,
 ) -> tuple[list[Paged], str | None]:
-    """Read a page of a project's rows, the newest first, of those that have the values of `where` that are not None."""
+    """Read a page of a project's rows, the newest first, of those that have the values of `where` that are not None.
+
+    Parameters
+    ----------
+    places_only
+        Whether nothing of the rows is loaded but their places in the list.
+    """
     statement = select(table).where(table.project_id == project_id)
+    if places_only:
+        statement = statement.options(load_only(table.id, table.created_us))
     statement = statement.filter_by(**{name: value for name, value in where.items() if value is not None})
     rows, following = page_of(session, statement, table.created_us, table.id, cursor=cursor, limit=limit)
     return [row for (row,) in rows], following
+
+
+def newest_after(row: Drive | Export | Job | Map | Scene | Webhook) -> str:
+    """The cursor of the page of `newest` that goes on after a row."""
+    return cursor_of(row.created_us, row.id)
 
 
 def cursor_of(*position: Any) -> str:

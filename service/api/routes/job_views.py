@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from itertools import accumulate
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session
@@ -13,13 +14,16 @@ from schemas.api.jobs import JobKind, JobProgress, JobResource
 from schemas.api.jobs import JobMember as MemberResource
 from schemas.api.jobs import JobState as ShownState
 from schemas.api.jobs import JobSubmap as SubmapResource
+from schemas.api.resource import Page
 from service.api.dependencies import moment
+from service.api.http.paging import newest, newest_after
 from service.database.connections import clock_us
 from service.database.tables import Job, JobAttempt, JobMember, JobState
 from service.domain import jobs
 from service.settings import Settings
 
 RETRY_AFTER_S = 2
+CHILDREN_OF_PAGE = 2000  # members and sub-maps that the jobs of a page show together, unless one alone has more
 
 
 def stalled_before_us(session: Session, settings: Settings) -> int:
@@ -59,6 +63,24 @@ def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list
         _shown(job, attempts.get(job.id, ()), members.get(job.id, ()), submaps.get(job.id, ()), stalled_us)
         for job in found
     ]
+
+
+def page_of_jobs(
+    session: Session, project_id: str, settings: Settings, *, cursor: str | None, limit: int, drive_id: str | None
+) -> Page[JobResource]:
+    """A page of a project's jobs, the newest first.
+
+    Each may show a thousand children: the page ends before the limit where they would be too many, and `next` goes on
+    with the first job that was left out. Of those that are left out nothing but their places in the list is loaded.
+    """
+    found, following = newest(session, Job, project_id, cursor=cursor, limit=limit, places_only=True, drive_id=drive_id)
+    children = jobs.children_of(session, [job.id for job in found])
+    until = list(accumulate(children.get(job.id, 0) for job in found))
+    shown = [job for job, count in zip(found, until, strict=True) if count <= CHILDREN_OF_PAGE] or found[:1]
+    if len(shown) < len(found):
+        following = newest_after(shown[-1])
+    session.scalars(select(Job).where(Job.id.in_([job.id for job in shown]))).all()  # completes those that are there
+    return Page[JobResource](items=views_of(session, shown, settings), next=following)
 
 
 def view_of(session: Session, job: Job, settings: Settings) -> JobResource:

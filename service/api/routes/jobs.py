@@ -26,12 +26,11 @@ from service.api.dependencies import (
     answer,
     expiry_us,
 )
-from service.api.http.paging import newest
 from service.api.http.ranges import none_match
 from service.api.http.responses import gives, problems
 from service.api.routes.aggregations import ACCEPTED, accepted
 from service.api.routes.downloads import IF_NONE_MATCH
-from service.api.routes.job_views import RETRY_AFTER_S, etag_of, view_of, views_of
+from service.api.routes.job_views import RETRY_AFTER_S, etag_of, page_of_jobs, view_of
 from service.database.tables import TERMINAL, Job, JobEvent, JobState, now_us
 from service.domain import aggregations, exports, job_trees, jobs
 from service.domain.access import require
@@ -67,10 +66,9 @@ def list_jobs(
     cursor: Cursor = None,
     drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
 ) -> Response:
-    """Jobs of the project, newest first."""
+    """Jobs of the project, newest first. A page ends before `limit` where its jobs have thousands of members."""
     with context.database.read() as session:
-        found, following = newest(session, Job, caller.project_id, cursor=cursor, limit=limit, drive_id=drive_id)
-        page = Page[JobResource](items=views_of(session, found, context.settings), next=following)
+        page = page_of_jobs(session, caller.project_id, context.settings, cursor=cursor, limit=limit, drive_id=drive_id)
     body = page.model_dump_json().encode()
     etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": etag, "Cache-Control": "no-cache"}

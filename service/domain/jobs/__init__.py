@@ -37,7 +37,7 @@ from service.domain.jobs._requests import (
     require_places,
     retry,
 )
-from service.domain.jobs._submaps import look_at_submaps, number_of, submaps_of, untold_parents
+from service.domain.jobs._submaps import children_of, look_at_submaps, number_of, submaps_of, untold_parents
 
 __all__ = [
     "FULL_BLAME",
@@ -58,6 +58,7 @@ __all__ = [
     "cancel_orphan",
     "cancel_requested",
     "cancelled",
+    "children_of",
     "claim",
     "create",
     "due",

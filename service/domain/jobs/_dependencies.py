@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sqlalchemy import and_, exists, func, or_, select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, load_only
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -169,9 +169,13 @@ def orphans(session: Session, *, among: Sequence[str] | None = None) -> list[str
 
 
 def members_of(session: Session, job_ids: Sequence[str]) -> dict[str, list[tuple[JobMember, Job | None]]]:
-    """The members of aggregations and the jobs that make their scenes, by the aggregation's id."""
+    """The members of aggregations and the jobs that make their scenes, by the aggregation's id.
+
+    Of those jobs only what is shown of a member is loaded: an aggregation may have a thousand.
+    """
     found: dict[str, list[tuple[JobMember, Job | None]]] = {}
-    statement = select(JobMember, Job).outerjoin(Job, Job.id == JobMember.child_id)
+    shown = load_only(Job.id, Job.kind, Job.state, Job.heartbeat_us, Job.percent)
+    statement = select(JobMember, Job).outerjoin(Job, Job.id == JobMember.child_id).options(shown)
     statement = statement.where(JobMember.job_id.in_(job_ids)).order_by(JobMember.job_id, JobMember.name)
     for member, child in session.execute(statement):
         found.setdefault(member.job_id, []).append((member, child))

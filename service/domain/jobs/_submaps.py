@@ -10,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import exists, or_, select
+from sqlalchemy import exists, func, or_, select
 from sqlalchemy.orm import Session, load_only
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
-from service.database.tables import TERMINAL, Job, JobState, now_us
+from service.database.tables import TERMINAL, Job, JobMember, JobState, now_us
 from service.domain.jobs._dependencies import WAITS, resolve_child, tell_aggregations
 from service.domain.jobs._queries import ACTIVE, change, tell_progress, tell_state
 
@@ -124,3 +124,14 @@ def submaps_of(session: Session, job_ids: Sequence[str]) -> dict[str, list[Job]]
     for job in session.scalars(select(Job).where(Job.parent_id.in_(job_ids)).options(shown)):
         found.setdefault(job.parent_id or "", []).append(job)
     return {parent_id: sorted(submaps, key=number_of) for parent_id, submaps in found.items()}
+
+
+def children_of(session: Session, job_ids: Sequence[str]) -> dict[str, int]:
+    """Number of the members of aggregations and of the sub-maps of reconstructions, by the job's id.
+
+    A job has either; one that has none is left out.
+    """
+    members = select(JobMember.job_id, func.count()).where(JobMember.job_id.in_(job_ids)).group_by(JobMember.job_id)
+    submaps = select(Job.parent_id, func.count()).where(Job.parent_id.in_(job_ids)).group_by(Job.parent_id)
+    counts = [*session.execute(members).all(), *session.execute(submaps).all()]
+    return {str(job_id): count for job_id, count in counts}
