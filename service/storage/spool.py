@@ -286,7 +286,11 @@ class Writer(Protocol[Written]):
 
 
 class BatchWriter(Generic[Written]):
-    """Writes one batch in a thread while the next one is being received."""
+    """Writes one batch in a thread while the next one is being received.
+
+    A batch that could not be written ends it: every later call raises the same again, so that nothing is written in
+    the place of what is missing.
+    """
 
     def __init__(self, writer: Writer[Written], on_disk: DiskLimiter) -> None:
         self._writer = writer
@@ -312,8 +316,9 @@ class BatchWriter(Generic[Written]):
 
     async def _written(self) -> None:
         if self._writing is not None:
-            writing, self._writing = self._writing, None
-            await writing
+            # A request that is cancelled must not take the batch along: the next one would be written in its place.
+            await asyncio.shield(self._writing)
+            self._writing = None
 
     async def _off_the_loop(self, function: Callable[..., Result], batch: list[bytes]) -> Result:
         async with self._on_disk:

@@ -2,29 +2,33 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import os
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from datetime import UTC, datetime, timedelta
 from email.utils import parsedate_to_datetime
 from http.client import HTTPConnection
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 import pytest
 from sqlalchemy import update
+from sqlalchemy.exc import OperationalError
 
 from service.api.app import sweep_uploads
 from service.api.routes import file_ingest, upload_writing
 from service.database.tables import Drive, Upload, now_us
 from service.domain import uploads as upload_records
 from service.storage import durability
-from service.storage.uploads.resumable import PartialFile, sweep
+from service.storage.spool import BATCH_BYTES
+from service.storage.uploads.resumable import Appender, PartialFile, append, sweep
 from tests.helpers.live_api import Api, Client, problem_of, wait_until
 from tests.helpers.tiny_drive import TinyDrive, png_of, tiny_drive, zip_of
 from tests.helpers.tus_client import OFFSET_TYPE, VERSION, begin, checksum, create, head, offset_of, patch
@@ -526,6 +530,89 @@ def test_the_disk_fills_up(client: Client, api: Api, monkeypatch: pytest.MonkeyP
     kept = offset_of(client, url)
     assert 0 < kept < len(data)
     assert patch(client, url, kept, data[kept:]).status_code == 204
+
+
+class _NoRoomOnce:
+    """`os.statvfs` of a disk that has no room when the second batch of an upload is written, and has some again."""
+
+    def __init__(self, folder: Path) -> None:
+        self._statvfs, self._folder, self._asked = os.statvfs, folder, 0
+
+    def __call__(self, path: Path) -> Any:
+        self._asked += path == self._folder
+        if path == self._folder and self._asked == 2:
+            return SimpleNamespace(f_bavail=0, f_frsize=1)
+        return self._statvfs(path)
+
+
+@pytest.mark.parametrize("more", [300_000, 900_000, BATCH_BYTES + 500_000])
+def test_nothing_is_written_in_the_place_of_what_had_no_room(
+    client: Client, api: Api, monkeypatch: pytest.MonkeyPatch, more: int
+) -> None:
+    """The refusal of one batch is seen when the next one is there, and that one may fit."""
+    data, drive_id = image(2 * BATCH_BYTES + 300_000 + more), client.create()
+    url = begin(client, drive_id, PATH, data)
+    with monkeypatch.context() as full:
+        full.setattr(os, "statvfs", _NoRoomOnce(api.settings.uploads_dir))
+        problem_of(patch(client, url, 0, data), 507, "disk-full")
+    kept = offset_of(client, url)
+    assert BATCH_BYTES <= kept < 2 * BATCH_BYTES
+    assert (api.settings.uploads_dir / f"{url.rsplit('/', 1)[1]}.bytes").read_bytes() == data[:kept]
+    assert patch(client, url, kept, data[kept:]).status_code == 204
+    assert stored(client, drive_id) == sha256_of(data)
+
+
+def test_a_database_that_is_away_writes_nothing_twice(
+    client: Client, api: Api, monkeypatch: pytest.MonkeyPatch, drive: TinyDrive
+) -> None:
+    """The names of an archive are looked up once its bytes are written."""
+    archive, drive_id = drive.zipped(), client.create(drive)
+    url = create(client, drive_id, len(archive), archive="").headers["location"]
+    with monkeypatch.context() as away:
+        away.setattr("service.domain.drives.named_files", _away)
+        problem_of(patch(client, url, 0, archive[:1000]), 503, "database-unavailable")
+    assert offset_of(client, url) == 1000
+    assert (api.settings.uploads_dir / f"{url.rsplit('/', 1)[1]}.bytes").read_bytes() == archive[:1000]
+    assert patch(client, url, 1000, archive[1000:]).status_code == 204
+    assert stored(client, drive_id) == sha256_of(drive.files[PATH])
+
+
+def _away(*_: object) -> set[str]:
+    raise OperationalError("SELECT", {}, Exception("database is locked"))
+
+
+@pytest.mark.parametrize("waits_for", ["its turn", "the batch before"])
+def test_a_cancelled_request_leaves_no_gap(tmp_path: Path, waits_for: str) -> None:
+    """A service that is told to stop cancels its requests, also those that wait for their turn on the disk."""
+    sent = [bytes([n]) * BATCH_BYTES for n in range(2)] + [b"rest"]
+    file = PartialFile(tmp_path, "upl_" + "0" * 30)
+    appender = Appender(file, offset=0, min_free_bytes=0, checksum=None, whole=None)
+
+    async def body(waiting: asyncio.Event) -> AsyncIterator[bytes]:
+        yield sent[0]
+        if waits_for == "the batch before":
+            waiting.set()
+            yield sent[1]
+        else:
+            yield sent[2]
+            waiting.set()
+
+    async def run() -> None:
+        on_disk, waiting = asyncio.Semaphore(1), asyncio.Event()
+        async with on_disk:
+            task = asyncio.create_task(append(body(waiting), appender, max_bytes=1 << 30, on_disk=on_disk))
+            await waiting.wait()
+            await asyncio.sleep(0.05)
+            task.cancel()
+            await asyncio.sleep(0.05)
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    asyncio.run(run())
+    written = file.path.read_bytes()
+    file.close()
+    assert len(written) == appender.offset >= BATCH_BYTES
+    assert b"".join(sent if waits_for == "the batch before" else [sent[0], sent[2]]).startswith(written)
 
 
 def test_killed_between_the_last_byte_and_the_end(client: Client, api: Api, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -181,7 +181,7 @@ async def append(stream: AsyncIterator[bytes], appender: Appender, *, max_bytes:
     ------
     ServiceError
         413 where there are more than `max_bytes`, 507 where the disk is full, and what the stream raises. What had
-        come until then is written, but for the first.
+        come until then is written, but for the first; behind what could not be written, nothing is.
     """
     writer: BatchWriter[int] = BatchWriter(appender, on_disk)
     batch: list[bytes] = []
@@ -197,13 +197,21 @@ async def append(stream: AsyncIterator[bytes], appender: Appender, *, max_bytes:
             if batched_bytes >= BATCH_BYTES:
                 await writer.write(batch)
                 batch, batched_bytes = [], 0
-        return await writer.finish(batch, _as_it_is)
+        last, batch = batch, []  # handed over: where that fails, it may be in the file already
+        return await writer.finish(last, _as_it_is)
     except BaseException:
         with anyio.CancelScope(shield=True):
-            with suppress(ServiceError, OSError):  # what has come counts, where it can be written
-                await writer.finish(batch, _as_it_is)
-            await writer.discard()
+            await _write_rest(writer, batch)
         raise
+
+
+async def _write_rest(writer: BatchWriter[int], batch: list[bytes]) -> None:
+    """Write what had come before a request broke, where that can be written, and nothing after it."""
+    try:
+        with suppress(Exception):  # the request ends with what broke it
+            await writer.finish(batch, _as_it_is)
+    finally:
+        await writer.discard()
 
 
 def _as_it_is(offset: int) -> int:
