@@ -23,7 +23,7 @@ from typing import BinaryIO, Protocol, TypeAlias
 from service.storage.uploads.archive_limits import SMALL_BYTES, require_ratio
 from service.storage.uploads.archive_names import is_ignored, safe_name, unexpected_files, without_top
 from service.storage.uploads.decompress import MAX_XZ_MEMORY_BYTES, compression_of
-from service.storage.uploads.tar_reader import MAX_HEADER_BYTES, checked_name, not_an_archive
+from service.storage.uploads.tar_reader import MAX_HEADER_BYTES, PAX_SIZE, checked_name, not_an_archive
 from service.storage.uploads.zip_reader import SIGNATURES
 
 Known = Callable[[Sequence[str]], Collection[str]]  # those of some names that are files of the drive
@@ -319,7 +319,8 @@ def _tar_steps() -> _Steps:
                 pax = _pax_records(data)
             continue
         member.name = pax.get("path", name if name is not None else member.name)
-        size_bytes = int(pax["size"]) if pax.get("size", "").isdigit() else member.size
+        # Another size is none: `checked_name` refuses the entry for it.
+        size_bytes = int(pax["size"]) if PAX_SIZE.fullmatch(pax.get("size", "")) else member.size
         member.pax_headers = pax
         if size_bytes < 0:
             return

@@ -37,7 +37,7 @@ _REFUSED = {
     b"D": "a list of files of an incremental backup",
 }
 _SPARSE_KEY = "GNU.sparse."
-_PAX_SIZE = re.compile("[0-9]{1,19}")
+PAX_SIZE = re.compile("[0-9]{1,19}")  # digits as int() takes them, and no number that takes long to read
 
 
 def read_tar(
@@ -219,7 +219,7 @@ def checked_name(member: tarfile.TarInfo) -> str:
         )
     name = safe_name(raw_name, is_folder=member.isdir())
     # Tarfile takes a pax size that is not a number for 0.
-    if member.size < 0 or not _PAX_SIZE.fullmatch(member.pax_headers.get("size", "0")):
+    if member.size < 0 or not PAX_SIZE.fullmatch(member.pax_headers.get("size", "0")):
         raise damaged(f"entry {shown(name)} declares a size that is negative or not a number")
     if member.isdir() and member.size:
         raise damaged(f"folder {shown(name)} has content")

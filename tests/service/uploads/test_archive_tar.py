@@ -50,8 +50,9 @@ def pax(**records: str) -> bytes:
     data = b""
     for key, value in records.items():
         record = f" {key.replace('__', '.')}={value}\n".encode()
-        length = len(record) + 2
-        length = len(record) + len(str(length))
+        length = len(record)
+        while length != len(record) + len(str(length)):
+            length = len(record) + len(str(length))
         data += str(length).encode() + record
     return data
 
@@ -163,7 +164,9 @@ def test_sizes_that_lie(unpacked: Unpacker, size: bytes, code: str, word: str) -
         ("-1", "damaged-archive", "not a number"),
         ("1e3", "damaged-archive", "not a number"),
         ("٣", "damaged-archive", "not a number"),
+        ("²", "damaged-archive", "not a number"),
         ("9" * 30, "damaged-archive", "not a number"),
+        ("9" * 4500, "damaged-archive", "not a number"),
         ("9" * 19, "archive-too-large", "bound of one file"),
     ],
 )

@@ -15,6 +15,7 @@ from schemas.file_names import composed
 from service.errors import ServiceError
 from service.storage.uploads.archive_watch import ArchiveWatch, KeptWatches
 from tests.service.uploads.test_archive import EXPECTED, PACKERS, Members, Pack, png, streamed_zip_of, tar_of, zip_of
+from tests.service.uploads.test_archive_tar import header, member, pax
 
 LONG = f"front/{'a' * 150}.png"
 PIECE_BYTES = 1000
@@ -123,6 +124,18 @@ def test_a_link_in_a_tar(tmp_path: Path) -> None:
         member.size = PNG_BYTES
         archive.addfile(member, io.BytesIO(bytes(PNG_BYTES)))
     assert refused(tmp_path / "archive", stream.getvalue(), "unsafe-archive", "a symbolic link") < PNG_BYTES
+
+
+@pytest.mark.parametrize("size", ["²", "٣", "9" * 20, "9" * 4500, "1e3", ""])
+def test_a_size_of_a_tar_that_is_no_number(tmp_path: Path, size: str) -> None:
+    data = member(b"PaxHeader", pax(size=size), b"x") + member() + bytes(1024)
+    refused(tmp_path / "archive", data, "damaged-archive", "'front/0.png'", "not a number")
+
+
+def test_a_size_of_a_tar_in_an_extended_header(tmp_path: Path) -> None:
+    strange = member(b"mine.txt")
+    data = member(b"PaxHeader", pax(size="1000"), b"x") + header(size=0) + bytes(1024) + strange + bytes(1024)
+    refused(tmp_path / "archive", data, "unexpected-file", "mine.txt")
 
 
 def test_what_is_no_archive(tmp_path: Path) -> None:
