@@ -91,6 +91,8 @@ class ArtifactStore:
     def put_file(self, path: Path, key: str, *, durable: bool = True) -> None:
         """Make the file `path` the object `key`; the file is gone afterwards.
 
+        Where it fails, the file is at `path` as before: it may be tried again, also under another key.
+
         Parameters
         ----------
         durable
@@ -103,20 +105,19 @@ class ArtifactStore:
             return
         os.chmod(path, 0o440)
         target = self._root / key
+        is_copy = _move_or_copy(path, target)
         try:
-            _move(path, target)
-        except OSError as error:
-            if error.errno != errno.EXDEV:
-                raise
-            partial = target.with_name(f".{secrets.token_hex(8)}.partial")
-            try:
-                shutil.copy2(path, partial)
-                partial.replace(target)
-            finally:
-                partial.unlink(missing_ok=True)
+            if durable:
+                self.sync(key)
+        except BaseException:
+            with contextlib.suppress(OSError):  # what the disk said first is what matters
+                if is_copy:
+                    target.unlink()
+                else:
+                    os.replace(target, path)
+            raise
+        if is_copy:
             path.unlink()
-        if durable:
-            self.sync(key)
 
     def put_files(self, files: Iterable[tuple[Path, str]], *, durable: bool = True) -> None:
         """Make each file an object, several at one time where the store is not a folder; see `put_file`.
@@ -335,6 +336,23 @@ def _link_or_copy(path: Path, target: Path) -> None:
             raise
         with _whole_or_gone(target):
             shutil.copy2(path, target)
+
+
+def _move_or_copy(path: Path, target: Path) -> bool:
+    """Move a file, or copy it where `target` is on another disk; whether it is a copy."""
+    try:
+        _move(path, target)
+        return False
+    except OSError as error:
+        if error.errno != errno.EXDEV:
+            raise
+    partial = target.with_name(f".{secrets.token_hex(8)}.partial")
+    try:
+        shutil.copy2(path, partial)
+        partial.replace(target)
+    finally:
+        partial.unlink(missing_ok=True)
+    return True
 
 
 def _move(path: Path, target: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import hashlib
 import os
 import socket
@@ -25,6 +26,7 @@ from service.settings import Settings
 from service.storage import artifacts
 from service.storage.artifacts import ArtifactStore
 from tests.helpers.live_api import HOST, free_port, settings_of, wait_until
+from worker.retry import retry
 
 CONTENT = os.urandom(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -237,6 +239,42 @@ def test_a_copy_to_another_disk_says_which_of_the_two_is_missing(tmp_path: Path,
     with pytest.raises(artifacts.ObjectMissingError):
         store.fetch("blobs/never", other_disk / "x")
     assert list(other_disk.iterdir()) == []
+
+
+class FailingSync:
+    """`os.fsync` of a disk that fails once, at the nth call."""
+
+    def __init__(self, nth: int) -> None:
+        self._fsync, self._left = os.fsync, nth
+
+    def __call__(self, descriptor: int) -> None:
+        self._left -= 1
+        if self._left == 0:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        self._fsync(descriptor)
+
+
+@pytest.mark.parametrize("nth", [1, 2, 3])
+@pytest.mark.parametrize("keys", [[KEY, KEY], [KEY, f"{KEY}-again"]])
+@pytest.mark.parametrize("beside", [True, False])
+def test_a_disk_that_fails_for_a_moment_loses_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, nth: int, keys: list[str], beside: bool
+) -> None:
+    """The worker tries again, under another key: what it stores is where it was until then."""
+    folder = tmp_path if beside else Path("/dev/shm")
+    if not folder.is_dir() or (folder.stat().st_dev == tmp_path.stat().st_dev) != beside:
+        pytest.skip("no second file system")
+    path, tries = folder / f"result-{os.getpid()}", iter(keys)
+    path.write_bytes(CONTENT)
+    store = ArtifactStore(settings_of(tmp_path / "data"))
+    monkeypatch.setattr(os, "fsync", FailingSync(nth))
+    try:
+        retry(lambda: store.put_file(path, next(tries)), budget_s=5)
+        assert not path.exists()
+    finally:
+        path.unlink(missing_ok=True)
+    assert store.read(keys[1]) == CONTENT
+    assert [item.key for item in store.objects()] == [keys[1]]
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
