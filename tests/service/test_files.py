@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import hashlib
+import io
 import json
+import os
 import socket
+import tarfile
 import threading
+import zipfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote, urlsplit
 
@@ -19,6 +25,7 @@ from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.blobs import Recorded
 from tests.helpers.live_api import Api, Client, forget_all, problem_of
 from tests.helpers.tiny_drive import TinyDrive, png, png_of, tiny_drive, zip_of
+from tests.service.conftest import StartApi
 
 
 def digest(data: bytes) -> str:
@@ -312,6 +319,71 @@ def test_a_full_quota_refuses_and_deleting_frees_it(api: Api, drive: TinyDrive) 
     assert api.project(client.project_id).used_bytes == 0
     assert api.objects(client.project_id) == []
     client.create(drive)
+
+
+def tar_of(files: dict[str, bytes]) -> bytes:
+    """A tar archive, compressed with xz, in which equal files take space once."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:xz", preset=1) as archive:
+        for path, data in files.items():
+            member = tarfile.TarInfo(path)
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+class _SpoolPeak:
+    """Most bytes that lie in the spool while a request is answered."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._ended = folder, threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self.most_bytes = 0
+
+    def __enter__(self) -> _SpoolPeak:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._ended.wait(0.002):
+            with contextlib.suppress(FileNotFoundError):
+                self.most_bytes = max(self.most_bytes, sum(e.stat().st_size for e in os.scandir(self._folder)))
+
+
+def test_an_archive_unpacks_to_no_more_than_the_quota(start_api: StartApi, drive: TinyDrive) -> None:
+    """Its ratio is below the bound, its own size within the quota: a small project must not fill the disk of all."""
+    api = start_api()
+    client = api.client(max_bytes=5_000_000)
+    drive_id = client.create(drive)
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as packing:
+        for path in drive.files:  # farther apart than deflate looks back
+            packing.writestr(path, png_of(64, 48, (os.urandom(512) + bytes(1 << 16)) * 50))
+        sizes = [entry.file_size for entry in packing.infolist()]
+    assert max(sizes) < 5_000_000 < sum(sizes) / 3
+    with _SpoolPeak(api.settings.spool_dir) as spool:
+        answer = client.put(f"/v1/drives/{drive_id}/archive", content=archive.getvalue())
+        problem = problem_of(answer, 413, "quota-full")
+    assert "the project may store 5000000" in problem["detail"]
+    assert spool.most_bytes < 10_000_000
+    assert api.spooled() == []
+
+
+def test_equal_files_of_an_archive_count_once(api: Api, drive: TinyDrive) -> None:
+    mask = png_of(64, 48, os.urandom(300_000))
+    client = api.client(max_bytes=len(drive.raw) + len(mask))
+    drive_id = client.create(drive)
+    answer = client.put(f"/v1/drives/{drive_id}/archive", content=tar_of(dict.fromkeys(drive.files, mask)))
+    assert answer.status_code == 200, answer.text
+    assert (answer.json()["stored"], answer.json()["files_stored"]) == (len(drive.files), len(drive.files))
+    assert api.project(client.project_id).used_bytes == len(drive.raw) + len(mask)
+    assert len(api.objects(client.project_id)) == 2
+    for path in drive.files:
+        assert client.get(f"/v1/drives/{drive_id}/files/{path}").content == mask
 
 
 def test_the_manifest_in_an_archive_may_be_written_in_another_way(client: Client, drive: TinyDrive) -> None:

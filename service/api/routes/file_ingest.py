@@ -126,6 +126,9 @@ def keep_archive(context: Context, project_id: str, drive_id: str, archive: Spoo
         drive = drives.get(session, project_id, drive_id)
         expected = set(session.scalars(select(DriveFile.path).where(DriveFile.drive_id == drive.id)))
         manifest_key = session.get_one(Blob, drive.manifest_blob_id).key
+        project = session.get_one(Project, project_id)
+        # Each file is new, and fits what is left of the quota, or one of those that the project has.
+        max_stored_bytes = max(project.max_bytes, project.used_bytes)
     settings = context.settings
     unpacked = unpack(
         archive.path,
@@ -138,6 +141,7 @@ def keep_archive(context: Context, project_id: str, drive_id: str, archive: Spoo
             max_ratio=settings.max_compression_ratio,
             max_file_bytes=settings.max_file_bytes,
             min_free_bytes=settings.min_free_disk_bytes,
+            max_stored_bytes=max_stored_bytes,
         ),
     )
     try:
@@ -151,7 +155,8 @@ def _keep_all(
     context: Context, project_id: str, drive_id: str, unpacked: list[tuple[str, Spooled]], replace: bool
 ) -> StoredFiles:
     with BlobWriter(context.database, context.artifacts, project_id=project_id, durable=False) as store:
-        stored = store.store_all([spooled for _, spooled in unpacked])
+        contents = {spooled.sha256: spooled for _, spooled in unpacked}
+        stored = store.store_all(list(contents.values()))
         # An archive may hold a hundred thousand files, and in SQLite all others who write wait for each transaction:
         # what takes long comes before the one that lets all files appear together.
         recorded = store.record(stored)
@@ -166,7 +171,7 @@ def _keep_all(
     with context.database.read() as session:
         drive = drives.get(session, project_id, drive_id)
         count = drives.stored_of(session, [drive])[drive_id].files
-    return StoredFiles(stored=len(stored), files_stored=count, files_expected=drive.files_expected)
+    return StoredFiles(stored=len(unpacked), files_stored=count, files_expected=drive.files_expected)
 
 
 def _same_manifest(context: Context, project_id: str, raw: bytes, stored: bytes) -> bool:

@@ -10,7 +10,7 @@ from schemas.file_names import MANIFEST_NAME
 from service.errors import ArchiveTooLarge, OtherManifest
 from service.storage.spool import Spooled, SpoolWriter
 from service.storage.uploads.archive_errors import shown
-from service.storage.uploads.archive_limits import ArchiveLimits
+from service.storage.uploads.archive_limits import ArchiveLimits, quota_too_small
 from service.storage.uploads.archive_names import EntryNames, is_ignored, may_be_manifest
 from service.storage.uploads.decompress import compression_of
 from service.storage.uploads.images import check_image
@@ -52,14 +52,14 @@ def unpack(
     Returns
     -------
     list of (str, Spooled)
-        The drive's files in the archive. The caller owns the spool files.
+        The drive's files in the archive; those of equal content share one spool file. The caller owns the spool files.
 
     Raises
     ------
     ServiceError
-        415 `not-an-archive`; 507 `disk-full`; else 422 that names the entry: `damaged-archive`, `unsupported-archive`,
-        `unsafe-archive`, `archive-too-large`, `unexpected-file`, `other-manifest`, `empty-archive`, or what
-        `check_image` refuses.
+        415 `not-an-archive`; 413 `quota-full`; 507 `disk-full`; else 422 that names the entry: `damaged-archive`,
+        `unsupported-archive`, `unsafe-archive`, `archive-too-large`, `unexpected-file`, `other-manifest`,
+        `empty-archive`, or what `check_image` refuses.
     """
     unpacking = _Unpacking(expected, folder, limits)
     try:
@@ -100,6 +100,8 @@ class _Unpacking:
         self._folder = folder
         self._limits = limits
         self._files: dict[str, Spooled] = {}
+        self._contents: dict[str, Spooled] = {}  # images and masks by their digests
+        self._stored_bytes = 0
 
     def write(self, name: str, size_bytes: int, content: Iterable[bytes]) -> None:
         """Unpack an entry, and check that it is an image."""
@@ -109,16 +111,35 @@ class _Unpacking:
                 f"{self._limits.max_manifest_bytes}",
                 remedy="Leave it out: the drive has its manifest.",
             )
+        is_image = not may_be_manifest(name)
+        if is_image:
+            self._require_quota(name, size_bytes)
         writer = SpoolWriter(self._folder, min_free_bytes=self._limits.min_free_bytes)
         try:
             for chunk in content:
                 writer.write(chunk)
-            if not may_be_manifest(name):
+            if is_image:
                 check_image(writer.path, name)
-            self._files[name] = writer.finish()
+            spooled = writer.finish()
+            self._files[name] = self._once(name, spooled) if is_image else spooled
         except BaseException:
             writer.discard()
             raise
+
+    def _once(self, name: str, spooled: Spooled) -> Spooled:
+        """The first file with these bytes; another one is removed, as it takes no space of the quota either."""
+        first = self._contents.setdefault(spooled.sha256, spooled)
+        if first is not spooled:
+            spooled.discard()
+            return first
+        self._stored_bytes += spooled.size_bytes
+        self._require_quota(name, self._stored_bytes)
+        return spooled
+
+    def _require_quota(self, name: str, size_bytes: int) -> None:
+        max_bytes = self._limits.max_stored_bytes
+        if max_bytes is not None and size_bytes > max_bytes:
+            raise quota_too_small(size_bytes, max_bytes, name)
 
     def finish(self, same_manifest: SameManifest) -> list[tuple[str, Spooled]]:
         """The drive's files by their names in it."""

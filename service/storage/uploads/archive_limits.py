@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from service.errors import ArchiveTooLarge, ServiceError
+from service.errors import ArchiveTooLarge, QuotaFull, ServiceError
 from service.storage.uploads.archive_errors import shown
 
 # Below this nothing is a bomb, and short files of one colour compress a thousandfold.
@@ -29,6 +29,8 @@ class ArchiveLimits:
         Of the disk, that must stay free.
     max_manifest_bytes
         Of the `drive.json` in the archive, which is read into memory.
+    max_stored_bytes
+        Of the drive's images and masks, unpacked, where equal ones count once: what their project may store.
     """
 
     max_entries: int
@@ -37,6 +39,7 @@ class ArchiveLimits:
     max_file_bytes: int
     min_free_bytes: int
     max_manifest_bytes: int = 64_000_000
+    max_stored_bytes: int | None = None
 
 
 class Budget:
@@ -83,6 +86,15 @@ def too_many_bytes(size: str, max_bytes: int, name: str | bytes) -> ServiceError
     return ArchiveTooLarge(
         f"the archive unpacks to {size} bytes with entry {shown(name)}, the bound is {max_bytes}",
         remedy="Send the drive in several archives.",
+    )
+
+
+def quota_too_small(size_bytes: int, max_stored_bytes: int, name: str) -> ServiceError:
+    """The archive's files, up to the named one, have more bytes than their project may store."""
+    return QuotaFull(
+        f"the files of the archive up to entry {shown(name)} have {size_bytes} bytes, equal ones counted once; the "
+        f"project may store {max_stored_bytes}",
+        remedy="Send fewer or smaller images, or ask the operator for a larger quota ('mrasfm projects set').",
     )
 
 

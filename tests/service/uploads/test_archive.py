@@ -132,10 +132,11 @@ class Unpacker:
         assert {file.path for _, file in files} == set(self.folder.iterdir())
         result = {}
         for name, file in files:
-            with file:
-                result[name] = file.path.read_bytes()
+            result[name] = file.path.read_bytes()
             assert file.sha256 == hashlib.sha256(result[name]).hexdigest()
             assert file.size_bytes == len(result[name])
+        for _, file in files:  # equal contents share one
+            file.discard()
         assert len(result) == len(files)
         return result
 
@@ -291,6 +292,26 @@ def test_too_many_bytes(unpacked: Unpacker, pack: Pack) -> None:
     unpacked.refused(archive, "archive-too-large", "over 200000 bytes", max_bytes=200_000)
     unpacked.refused(archive, "archive-too-large", "'front/0.png'", "bound of one file", max_file_bytes=40_000)
     assert len(unpacked(archive, max_bytes=300_000, max_file_bytes=60_000)) == len(EXPECTED)
+
+
+def test_more_bytes_than_the_project_may_store(unpacked: Unpacker, pack: Pack) -> None:
+    archive = pack([(name, png(filler=50_000)) for name in EXPECTED])
+    words = ("have 20", "equal ones counted once; the project may store 200000")
+    unpacked.refused(archive, "quota-full", *words, status=413, max_stored_bytes=200_000)
+    unpacked.refused(archive, "quota-full", "'front/0.png'", status=413, max_stored_bytes=40_000)
+    assert len(unpacked(archive, max_stored_bytes=300_000)) == len(EXPECTED)
+
+
+def test_equal_files_take_space_once(unpacked: Unpacker, pack: Pack) -> None:
+    """Masks of a vehicle that is always at the same place in the image are."""
+    mask = png(filler=50_000)
+    archive = pack([*((name, mask) for name in EXPECTED), ("drive.json", json.dumps(MANIFEST).encode())])
+    files = unpacked.spooled(archive, EXPECTED, max_stored_bytes=len(mask))
+    assert [name for name, _ in files] == list(EXPECTED)
+    (path,) = unpacked.folder.iterdir()
+    assert {file.path for _, file in files} == {path}
+    path.unlink()
+    assert unpacked(archive, max_stored_bytes=len(mask)) == dict.fromkeys(EXPECTED, mask)
 
 
 @pytest.mark.parametrize("kind", ["zip deflated", "tar gzip", "tar bzip2", "tar xz"])
