@@ -1,4 +1,7 @@
-"""Findings on a receiver: why it is not used, jumps of its error, its clock, and a rig whose scale it contradicts."""
+"""Findings on a receiver: why it is not used, jumps of its error, its clock, and a rig whose scale it contradicts.
+
+Rough poses may contradict that, too.
+"""
 
 from __future__ import annotations
 
@@ -85,20 +88,45 @@ def clock_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
 
 def rig_scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
     """The finding that the receiver contradicts the rig's scale."""
+    if not contradicts_rig(mapper, placement, placement.scale_of_rig):
+        return []
+    return [
+        warning(
+            "scale-disagreement",
+            f"GNSS makes {_length_beside_rig(mapper, placement.scale_of_rig)}",
+            "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
+            "swapped?). Declare sigma_translation_m of the cameras.",
+        )
+    ]
+
+
+def rough_scale_findings(mapper: Mapper, scale_of_rig: float | None) -> list[Finding]:
+    """The finding that rough poses contradict the rig's scale, where they do; see `Refinement.scale_of_rough_poses`."""
+    if scale_of_rig is None:
+        return []
+    return [
+        warning(
+            "scale-disagreement",
+            f"rough_poses make {_length_beside_rig(mapper, scale_of_rig)}: the scene has their scale",
+            "Check that positions in rough_poses and baselines in rig.cameras are metres, and declare "
+            "sigma_translation_m of both. Leave poses out that have no metric scale.",
+        )
+    ]
+
+
+def contradicts_rig(mapper: Mapper, placement: Placement, scale_of_rig: float) -> bool:
+    """Return whether positions give the rig's lengths as given another scale, beyond what they leave open of it."""
     positions = placement.prior
     assert positions is not None
     antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
     centred_m = antenna_m - antenna_m.mean(0)
     known = positions.information_given(centred_m, rigid_motions(centred_m))
     sigma = 1.0 / np.sqrt(max(known, 1e-12))
-    if abs(placement.scale_of_rig - 1.0) <= max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma):
-        return []
-    return [
-        warning(
-            "scale-disagreement",
-            f"GNSS makes the way {placement.scale_of_rig:.3g} times as long as the rig as given does, whose "
-            f"baselines are taken to be known to {scale_of_baselines(mapper)[1]:.1%}",
-            "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
-            "swapped?). Declare sigma_translation_m of the cameras.",
-        )
-    ]
+    return bool(abs(scale_of_rig - 1.0) > max(MAX_SCALE_DISAGREEMENT, SCALE_DISAGREEMENT_SIGMAS * sigma))
+
+
+def _length_beside_rig(mapper: Mapper, scale_of_rig: float) -> str:
+    return (
+        f"the way {scale_of_rig:.3g} times as long as the rig as given does, whose baselines are taken to be known to "
+        f"{scale_of_baselines(mapper)[1]:.1%}"
+    )

@@ -23,6 +23,7 @@ from mrasfm_engine.mapping.calibration import (
     hold_baselines,
     observed_directions,
     resolve_scale,
+    scale_of_baselines,
     sigma_scale_of_images,
     take_calibration,
 )
@@ -43,6 +44,7 @@ from mrasfm_engine.mapping.miscalibration import (
 from mrasfm_engine.mapping.moving_objects import drop_moving
 from mrasfm_engine.mapping.other_sizes import with_other_sizes
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.receiver_findings import contradicts_rig
 from mrasfm_engine.mapping.refinement_result import (
     Refinement,
     certainty_of,
@@ -69,6 +71,7 @@ ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions or time offsets change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
+BOTH_RIGHT_SIGMAS = 2.0  # of the scales by rough poses and by the rig as given, within which both may be right
 BEHIND = 0.1  # of an observation's sigma, that a scene may stay behind baselines that are held
 
 
@@ -215,6 +218,7 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
         result.certainty = with_other_sizes(
             mapper, result.certainty, lambda: _adjust_all_cameras(mapper, result, free_units, cancel)
         )
+    _compare_rough_poses_with_rig(mapper, result)
     result.directions = observed_directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
@@ -239,6 +243,26 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
     known = calibration_prior(mapper), mapper.state, result.directions
     result.miscalibrations = find_miscalibrations(*known)
     result.wrong_pair = find_wrong_pair(*known)
+
+
+def _compare_rough_poses_with_rig(mapper: Mapper, result: Refinement) -> None:
+    """Find a scale of rough poses that contradicts the rig; which of both is wrong nothing tells.
+
+    The scene has that of the poses, as its baselines follow them. Where both cannot be right by what is known of them,
+    it may be as far off as they differ.
+    """
+    rough = result.absolute.rough
+    if result.georeferenced or rough is None or rough.prior is None or mapper.drive.has_single_camera:
+        return
+    factor, sigma_rig = scale_of_baselines(mapper)
+    if not contradicts_rig(mapper, rough, 1.0 / factor):
+        return
+    result.scale_of_rough_poses = 1.0 / factor
+    if result.certainty is None:
+        return
+    off = abs(float(np.log(factor)))
+    if off > BOTH_RIGHT_SIGMAS * np.hypot(sigma_rig, result.certainty.sigma_scale):
+        result.certainty = result.certainty.with_scale_error(off)
 
 
 def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel | None) -> None:

@@ -46,6 +46,7 @@ class Refinement:
     sigma_px: float = 1.0
     absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
+    scale_of_rough_poses: float | None = None  # factor on the rig's lengths as given, where they contradict these
     given_scale: ScalePrior | None = None  # what the rotations as given say of it, where positions do not
     intrinsics: IntrinsicsDecision | None = None  # decided once the calibration is
     is_of_one_camera: bool = False  # by its images; its intrinsics may vary, at its place in the rig as given

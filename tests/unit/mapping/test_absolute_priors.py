@@ -17,7 +17,7 @@ from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import place_by_gnss
-from mrasfm_engine.mapping.receiver_findings import jump_findings
+from mrasfm_engine.mapping.receiver_findings import jump_findings, rough_scale_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import RoughPose, RoughTrajectory
@@ -92,6 +92,21 @@ def test_rough_poses_say_how_large_the_scene_is_and_where_it_lies(wrong: int) ->
     assert 1e-3 < np.sqrt((off_m**2).mean()) < 0.8 * ROUGH_M
     assert result.certainty is not None
     assert result.certainty.sigma_scale < 0.02
+
+
+def test_rough_poses_of_another_scale_than_the_rig_are_a_finding_and_the_sigma_holds_the_difference() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
+    poses = rough_poses(simulated)
+    poses[:, :3, 3] *= 0.4
+    simulated = with_rough_poses(simulated, poses)
+    mapper = mapped(simulated, AbsolutePriors(rough_world_from_rig=poses))
+    result = refine(mapper, AbsolutePriors(rough_world_from_rig=poses))
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.35 < scale < 0.45
+    [finding] = rough_scale_findings(mapper, result.scale_of_rough_poses)
+    assert "rough_poses make the way 0.40" in finding.what
+    assert result.certainty is not None
+    assert 0.3 < -np.log(scale) / result.certainty.sigma_scale < 1.5
 
 
 def test_receiver_and_rough_poses_stand_side_by_side_in_worlds_of_their_own() -> None:
