@@ -60,14 +60,19 @@ MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_SIGMA_TIME_OFFSET_US = 1_000_000
 MAX_COORDINATE_M = 1e8  # beyond this, metres lose their millimetres in float64 arithmetic
 UNIT_ROUNDING = 1e-14  # of a quaternion's norm
+MIN_SIGMA = 1e-9  # of its unit: nothing on a vehicle is known better, and the square of a smaller one vanishes
+LAST_TIMESTAMP_US = 253_402_300_799_999_999  # the last of the year 9999, since 1970: calendars end there
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False, le=1e6)]
-TimestampUs = Annotated[int, Field(ge=0, le=2**62, strict=True)]
+Sigma = Annotated[float, Field(ge=MIN_SIGMA, allow_inf_nan=False, le=1e6)]
+TimestampUs = Annotated[int, Field(ge=0, le=LAST_TIMESTAMP_US, strict=True)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 MAX_VEHICLE_CHARACTERS = 64
 VEHICLE_PATTERN = rf"^[A-Za-z0-9][A-Za-z0-9_.:-]{{0,{MAX_VEHICLE_CHARACTERS - 1}}}$"
 Vehicle = Annotated[str, Field(pattern=VEHICLE_PATTERN)]
+# Names that people read have no control characters: terminals would obey them.
+PRINTED_NAME_PATTERN = r"^[^\x00-\x1f\x7f-\x9f]+$"
+DriveName = Annotated[str, Field(min_length=1, max_length=200, pattern=PRINTED_NAME_PATTERN)]
 
 
 def _relative_path(value: str) -> str:
@@ -153,18 +158,18 @@ class Camera(_Model):
         description="the camera's pose in the rig; camera axes are x right, y down, z forward. Its translation is "
         "where the camera sits on the vehicle"
     )
-    sigma_rotation_deg: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
-    sigma_translation_m: Positive | None = Field(None, description="how well rig_from_cam is known, per axis")
-    sigma_focal_px: Positive | None = Field(None, description="how well the focal length is known")
-    sigma_principal_point_px: Positive | None = Field(
+    sigma_rotation_deg: Sigma | None = Field(None, description="how well rig_from_cam is known, per axis")
+    sigma_translation_m: Sigma | None = Field(None, description="how well rig_from_cam is known, per axis")
+    sigma_focal_px: Sigma | None = Field(None, description="how well the focal length is known")
+    sigma_principal_point_px: Sigma | None = Field(
         None, description="since version 2: how well the principal point is known, per axis"
     )
-    sigma_distortion: Positive | None = Field(
+    sigma_distortion: Sigma | None = Field(
         None,
         description="since version 2: how well the radial terms of distortion are known: k1 and k2, "
         "of a fisheye k1 to k4; k3 to k6 of FULL_OPENCV stay as given",
     )
-    sigma_time_offset_us: Annotated[Positive, Field(le=MAX_SIGMA_TIME_OFFSET_US)] | None = Field(
+    sigma_time_offset_us: Annotated[Sigma, Field(le=MAX_SIGMA_TIME_OFFSET_US)] | None = Field(
         None,
         description="since version 2: how well the camera's timestamps are known as a whole, microseconds; with it the "
         "offset is estimated also where the timestamps of all cameras agree",
@@ -270,8 +275,8 @@ class GnssSample(_Model):
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] = Field(description="positive in the north")
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] = Field(description="positive in the east")
     height_m: Annotated[float, Field(ge=-1000, le=20000)] = Field(description="above height_datum")
-    sigma_horizontal_m: Positive = Field(description="standard deviation of each horizontal axis")
-    sigma_vertical_m: Positive = Field(description="standard deviation of the height")
+    sigma_horizontal_m: Sigma = Field(description="standard deviation of each horizontal axis")
+    sigma_vertical_m: Sigma = Field(description="standard deviation of the height")
 
 
 class Gnss(_Model):
@@ -307,8 +312,8 @@ class RoughTrajectory(_Model):
     poses: Annotated[list[RoughPose], Field(min_length=1, max_length=MAX_GNSS_SAMPLES), FailFast()] = Field(
         description="in order of time"
     )
-    sigma_translation_m: Positive = Field(0.5, description="standard deviation, per axis")
-    sigma_rotation_deg: Positive = Field(2.0, description="standard deviation, about each axis")
+    sigma_translation_m: Sigma = Field(0.5, description="standard deviation, per axis")
+    sigma_rotation_deg: Sigma = Field(2.0, description="standard deviation, about each axis")
     common_world: Name | None = Field(
         None,
         description="name of the world frame, where other drives have rough poses in the same one: scenes of drives "
@@ -383,7 +388,7 @@ class DriveManifest(_Model):
     model_config = ConfigDict(json_schema_extra={"examples": [EXAMPLE_MANIFEST]})
 
     version: Literal[1, 2] = Field(1, description="of this contract")
-    name: Annotated[str, Field(min_length=1, max_length=200)] = Field(description="what results are called")
+    name: DriveName = Field(description="what results are called")
     vehicle: Vehicle | None = Field(
         None,
         description="since version 2: which vehicle drove, by its fleet number or another name without spaces; drives "

@@ -11,7 +11,7 @@ from typing import Any, Never, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from schemas.drive import DriveManifest
+from schemas.drive import MIN_SIGMA, DriveManifest
 from schemas.file_names import name_problems
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
@@ -225,6 +225,12 @@ def _problem(detail: dict[str, Any]) -> FieldProblem:
         what = f"{detail['input']} is not a latitude (-90 to 90): are latitude and longitude swapped?"
     elif path.endswith("timestamp_us") and kind in ("int_type", "int_from_float"):
         what = f"{detail['input']!r} must be an integer number of microseconds"
+    elif path.endswith("timestamp_us") and kind == "less_than_equal":
+        what = f"{detail['input']} is after the year 9999: give microseconds (are these nanoseconds?)"
+    elif kind == "greater_than_equal" and str(detail["loc"][-1]).startswith("sigma_"):
+        what = f"{detail['input']} is no standard deviation: give {MIN_SIGMA:g} or more (nothing is known better)"
+    elif kind == "string_pattern_mismatch" and not str(detail["input"]).isprintable():
+        what = f"{detail['input'][:MAX_KEY_SHOWN]!r} holds control characters: give a name that can be printed"
     elif not what.startswith(("must", "coordinates")) and isinstance(detail["input"], str | int | float | None):
         what = f"{what} (is {str(detail['input'])[:80]!r})"
     return FieldProblem(path, what)

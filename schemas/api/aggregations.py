@@ -8,11 +8,12 @@ from pydantic import ConfigDict, Field, StringConstraints
 
 from schemas.api.jobs import DriveId, ReconstructionSettings
 from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_MAP, EXAMPLE_OTHER_DRIVE, EXAMPLE_SCENE, RequestBody
+from schemas.drive import PRINTED_NAME_PATTERN
 
 MAX_MEMBERS = 1000
 SceneId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
 MapId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
-MapName = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f]+$")]
+MapName = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=PRINTED_NAME_PATTERN)]
 
 
 class AggregationRequest(RequestBody):
