@@ -12,10 +12,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from mrasfm_engine.errors import InputError
 from schemas.drive import MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
 from schemas.methods import ExtractorName, MatcherName
+from schemas.parsing import MAX_PROBLEMS_SHOWN
 
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-Share = Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)]
-Threshold = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+# The squares of numbers beyond these, and their inverses, leave what float64 can hold to equations.
+SMALLEST, LARGEST = 1e-9, 1e9
+Positive = Annotated[float, Field(ge=SMALLEST, le=LARGEST, allow_inf_nan=False)]
+Share = Annotated[float, Field(ge=SMALLEST, le=1, allow_inf_nan=False)]
+Threshold = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 # No drive has more frames, cameras and pairs of an image than this; larger numbers are slips, which libraries below the
 # engine would answer with tracebacks.
 MAX_COUNT = 1_000_000
@@ -31,7 +34,7 @@ def _available_cores() -> int:
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)  # TOML has types: "no" is none of them
 
 
 class FeatureConfig(_Section):
@@ -319,7 +322,7 @@ class SemanticsConfig(_Section):
 class ModelsConfig(_Section):
     """Trained models and their execution."""
 
-    folder: Path | None = Field(
+    folder: Annotated[Path, Field(strict=False)] | None = Field(
         None, description="folder of the trained models; by default `MRASFM_MODELS` or the user's data folder"
     )
     gpu: bool = Field(True, description="a GPU is used where onnxruntime has a provider for one that starts")
@@ -346,6 +349,14 @@ class EngineConfig(_Section):
     )
 
 
+def described(error: ValidationError) -> str:
+    """Describe settings that are unknown or out of range: all, up to a number that a screen has room for."""
+    problems = error.errors(include_url=False)
+    shown = [f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems[:MAX_PROBLEMS_SHOWN]]
+    more = len(problems) - len(shown)
+    return "; ".join([*shown, *([f"and {more} more"] if more else [])])
+
+
 def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
     """The settings in a TOML file over the defaults, and `overrides` (top-level fields) over those.
 
@@ -367,9 +378,7 @@ def read_config(path: Path | None, **overrides: Any) -> EngineConfig:
     try:
         return EngineConfig.model_validate(values | overrides)
     except ValidationError as error:
-        first = error.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            f"{path or 'settings'}: {field}: {first['msg']}",
+            f"{path or 'settings'}: {described(error)}",
             remedy="`mrasfm describe settings` prints all settings and their meaning.",
         ) from error

@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.config import EngineConfig, described
 from mrasfm_engine.errors import InputError
 
 # Name in the API's ReconstructionSettings -> section of the engine's (None: none) and name there.
@@ -45,8 +45,6 @@ def engine_config(settings: Mapping[str, Any], *, threads: int) -> EngineConfig:
     try:
         return EngineConfig.model_validate(values)
     except ValidationError as problem:
-        first = problem.errors()[0]
-        field = ".".join(str(part) for part in first["loc"])
         raise InputError(
-            f"settings: {field}: {first['msg']}", remedy="Give a value in its range.", code="bad-settings"
+            f"settings: {described(problem)}", remedy="Give values in their ranges.", code="bad-settings"
         ) from problem

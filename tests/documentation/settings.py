@@ -100,4 +100,5 @@ def _range(form: Mapping[str, Any]) -> Iterator[str]:
             ("exclusiveMaximum", "<"),
         ):
             if keyword in kind:
-                yield f"{sign} {kind[keyword]}"
+                bound = kind[keyword]
+                yield f"{sign} {bound:g}" if isinstance(bound, float) else f"{sign} {bound}"

@@ -17,25 +17,24 @@ from pydantic import ValidationError
 from mrasfm_engine.config import EngineConfig
 from schemas import DocumentError, parse_manifest
 from schemas.api.jobs import ReconstructionSettings
-from schemas.drive import MAX_IMAGE_SIDE_PX
+from schemas.drive import LAST_TIMESTAMP_US, MAX_IMAGE_SIDE_PX, MIN_SIGMA
 from schemas.export import SCHEMA_FILE
 
 TEXT = SCHEMA_FILE.with_name("README.md").read_text(encoding="utf-8")
 EXAMPLE: dict[str, Any] = json.loads(re.findall(r"```json\n(.*?)```", TEXT, flags=re.DOTALL)[0])
-POSITIVE = 5e-324
 # Path in the documented example, least and greatest value, and whether only whole numbers are taken.
 NUMBERS = [
     ("rig.cameras.0.width", 1, MAX_IMAGE_SIDE_PX, True),
     ("rig.cameras.0.height", 1, MAX_IMAGE_SIDE_PX, True),
-    ("rig.cameras.0.sigma_rotation_deg", POSITIVE, 1e6, False),
-    ("rig.cameras.0.sigma_translation_m", POSITIVE, 1e6, False),
-    ("frames.0.timestamp_us", 0, 2**62, True),
+    ("rig.cameras.0.sigma_rotation_deg", MIN_SIGMA, 1e6, False),
+    ("rig.cameras.0.sigma_translation_m", MIN_SIGMA, 1e6, False),
+    ("frames.0.timestamp_us", 0, LAST_TIMESTAMP_US, True),
     ("frames.0.source_frame", 0, 2**31 - 1, True),
     ("gnss.samples.0.latitude_deg", -90, 90, False),
     ("gnss.samples.0.longitude_deg", -180, 180, False),
     ("gnss.samples.0.height_m", -1000, 20000, False),
-    ("gnss.samples.0.sigma_horizontal_m", POSITIVE, 1e6, False),
-    ("gnss.samples.0.sigma_vertical_m", POSITIVE, 1e6, False),
+    ("gnss.samples.0.sigma_horizontal_m", MIN_SIGMA, 1e6, False),
+    ("gnss.samples.0.sigma_vertical_m", MIN_SIGMA, 1e6, False),
 ]
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
@@ -126,6 +125,19 @@ SETTINGS = [
     for section, part in EngineConfig.model_json_schema()["$defs"].items()
     for name, form in bounded(part)
 ]
+
+
+def test_every_numeric_setting_has_two_bounds() -> None:
+    """Numbers near the ends of float64 would overflow in equations and end in tracebacks."""
+    numbers = [
+        (section, name, form)
+        for section, part in EngineConfig.model_json_schema()["$defs"].items()
+        for name, field in part["properties"].items()
+        for form in field.get("anyOf", [field])
+        if form.get("type") in ("integer", "number")
+    ]
+    assert len(numbers) > 40
+    assert [(section, name) for section, name, form in numbers if not {"minimum", "maximum"} <= set(form)] == []
 
 
 @pytest.mark.parametrize(
