@@ -256,11 +256,17 @@ def select_cameras(recording: Recording, names: Sequence[str] | None) -> Recordi
     Raises
     ------
     InputError
-        If it has no camera of such a name.
+        If no camera is named, it has no camera of such a name, or no image of those that are named.
     """
     if names is None:
         return recording
     known = [camera.name for camera in recording.cameras]
+    if not names:
+        raise InputError(
+            "--cameras names no camera",
+            remedy=f"Choose among {', '.join(known)}, or leave --cameras out for all.",
+            code="empty-selection",
+        )
     if unknown := [name for name in names if name not in known]:
         raise InputError(
             f"the recording has no camera {', '.join(unknown)}",
@@ -271,6 +277,12 @@ def select_cameras(recording: Recording, names: Sequence[str] | None) -> Recordi
         replace(unit, images={name: image for name, image in unit.images.items() if name in names})
         for unit in recording.units
     ]
+    if not any(unit.images for unit in units):
+        raise InputError(
+            f"the recording has no images of --cameras {','.join(names)}",
+            remedy=f"Choose among {', '.join(known)}.",
+            code="empty-selection",
+        )
     return replace(
         recording,
         cameras=[camera for camera in recording.cameras if camera.name in names],

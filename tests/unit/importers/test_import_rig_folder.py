@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mrasfm_engine.cli import EXIT_BAD_INPUT, main
 from mrasfm_engine.commands import import_drive
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.importers import drive_writer
@@ -178,6 +179,22 @@ def test_slice_that_selects_nothing(recording: Path, tmp_path: Path) -> None:
     error = refused(recording, tmp_path / "drive", frames="8:20")
     assert error.code == "empty-selection"
     assert "0:8" in error.remedy
+
+
+@pytest.mark.parametrize("names", ["", ",", " , "])
+def test_a_choice_of_no_camera(recording: Path, tmp_path: Path, names: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["import", str(recording), "--out", str(tmp_path / "drive"), "--cameras", names]) == EXIT_BAD_INPUT
+    said = capsys.readouterr().err
+    assert "--cameras names no camera" in said
+    assert "cam_l, cam_r" in said
+    assert not (tmp_path / "drive").exists()
+
+
+def test_a_choice_of_cameras_without_images(recording: Path, tmp_path: Path) -> None:
+    for file in (recording / "cam_r").iterdir():
+        file.unlink()
+    error = refused(recording, tmp_path / "drive", cameras=["cam_r"])
+    assert (error.code, error.what) == ("empty-selection", "the recording has no images of --cameras cam_r")
 
 
 def test_slice_is_pythons() -> None:
