@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +29,7 @@ from mrasfm_engine.importers.rough_poses import with_rough_poses
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
-from schemas.drive import MAX_RIG_EXTENT_M
+from schemas.drive import MAX_RIG_EXTENT_M, MAX_VEHICLE_CHARACTERS, VEHICLE_PATTERN
 
 LAYOUTS: tuple[ModuleType, ...] = (
     rig_folder,
@@ -97,6 +98,7 @@ def import_recording(
         If the drive cannot be written.
     """
     folder, out = Path(folder), Path(out)
+    _require_vehicle_name(vehicle)
     if not folder.exists():
         raise InputError(f"recording {folder} does not exist", remedy="Check the path.", code="missing-folder")
     if folder.resolve() == out.resolve() or out.resolve() in folder.resolve().parents:
@@ -113,6 +115,16 @@ def import_recording(
         if recording.truth_is_gnss and not truth:
             recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
         return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
+
+
+def _require_vehicle_name(vehicle: str | None) -> None:
+    if vehicle is not None and not re.fullmatch(VEHICLE_PATTERN, vehicle):
+        raise InputError(
+            f"--vehicle {vehicle!r} is no name of a vehicle",
+            remedy=f"Give 1 to {MAX_VEHICLE_CHARACTERS} letters, digits and _ . : - without spaces, the first a letter "
+            "or a digit.",
+            code="bad-vehicle",
+        )
 
 
 def _read(path: Path, options: Mapping[str, Any], scratch: Path) -> Recording:

@@ -207,7 +207,11 @@ def _value(text: str, column: str, *, where: str) -> float:
         raise InputError(
             f"{where}, column {column}: {text[:40]!r} is not {kind}", remedy=remedy, code="bad-gnss-file"
         ) from None
-    if not lower <= value <= upper:  # also refuses NaN
+    if not math.isfinite(value):
+        raise InputError(
+            f"{where}, column {column}: {text[:40]} is not a finite number", remedy=remedy, code="bad-gnss-file"
+        )
+    if not lower <= value <= upper:
         raise InputError(f"{where}, column {column}: {text[:40]} {complaint}", remedy=remedy, code="bad-gnss-file")
     return value
 

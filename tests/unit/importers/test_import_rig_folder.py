@@ -83,7 +83,10 @@ def test_the_vehicle_of_the_rig(recording: Path, tmp_path: Path) -> None:
     edit_rig(recording, lambda document: document.update(vehicle="M AB"))
     assert "vehicle" in refused(recording, tmp_path / "other").what
     edit_rig(recording, lambda document: None)
-    assert "vehicle" in refused(recording, tmp_path / "other", vehicle="M AB").what
+    error = refused(recording, tmp_path / "other", vehicle="M AB")
+    assert error.what == "--vehicle 'M AB' is no name of a vehicle"
+    assert "without spaces" in error.remedy
+    assert "--vehicle" in refused(recording, tmp_path / "other", vehicle="M-AB\n").what
 
 
 def test_cameras_whose_folders_are_one_on_many_systems(recording: Path, tmp_path: Path) -> None:
