@@ -18,6 +18,7 @@ from mrasfm_engine.importers.arrow_tables import Columns, read_feather
 from mrasfm_engine.importers.frame_grouping import units_by_time
 from mrasfm_engine.importers.recording import Recording, SourceImage, choose_scene, interpolated_poses, with_truth
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
+from mrasfm_engine.importers.skipped_images import unread_files
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera
 from schemas.drive import MAX_CAMERAS
@@ -93,6 +94,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         units=with_truth(units, truth),
         common_world=None if city is None else f"av2-{city}",
         notes=[*NOTES],
+        unread_files={name: unread_files(log / "sensors" / "cameras" / name) for name in images},
     )
 
 

@@ -20,7 +20,8 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.geotags import GeoTag, read_exif, read_geo_txt
 from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, gnss_of_vehicle
-from mrasfm_engine.importers.rig_folder import IMAGE_SUFFIXES, checked_camera
+from mrasfm_engine.importers.rig_folder import checked_camera
+from mrasfm_engine.importers.skipped_images import IMAGE_SUFFIXES
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.io.image_header import read_header

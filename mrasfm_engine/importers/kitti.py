@@ -15,6 +15,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, pose_of_projection
 from mrasfm_engine.importers.rig_folder import frame_times, numbered_images, pinhole_camera, read_upright_poses
+from mrasfm_engine.importers.skipped_images import unread_files
 from mrasfm_engine.importers.tables import read_lines
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.types import Floats
@@ -64,6 +65,7 @@ def read(folder: Path) -> Recording:
         cameras=cameras,
         units=units,
         body_axes=BodyAxes.RDF,
+        unread_files={name: unread_files(folder / name) for name in names},
     )
 
 

@@ -26,6 +26,7 @@ from mrasfm_engine.importers.recording import (
     proper_transform,
 )
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
+from mrasfm_engine.importers.skipped_images import unread_files
 from mrasfm_engine.importers.tables import read_lines, read_numbers
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera, Gnss
@@ -109,6 +110,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         gnss=gnss,
         truth_is_gnss=True,
         notes=[*NOTES],
+        unread_files={camera: unread_files(drive / camera / "data") for camera in CAMERAS},
     )
 
 

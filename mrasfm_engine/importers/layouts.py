@@ -26,6 +26,7 @@ from mrasfm_engine.importers import (
 from mrasfm_engine.importers.drive_writer import ImportSummary, folder_beside, write_recording
 from mrasfm_engine.importers.recording import Recording, RoughQuality, SourceUnit, select_cameras, select_units
 from mrasfm_engine.importers.rough_poses import with_rough_poses
+from mrasfm_engine.importers.skipped_images import notes_of_missing_images, notes_of_unread_files
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
@@ -114,7 +115,8 @@ def import_recording(
             recording = with_rough_poses(recording, rough_noise)
         if recording.truth_is_gnss and not truth:
             recording = replace(recording, units=[replace(unit, world_from_rig=None) for unit in recording.units])
-        return write_recording(_with_gnss(recording, folder, gnss_file), out, copy=copy, force=force)
+        recording = _with_notes_of_images(_with_gnss(recording, folder, gnss_file))
+        return write_recording(recording, out, copy=copy, force=force)
 
 
 def _require_vehicle_name(vehicle: str | None) -> None:
@@ -153,6 +155,12 @@ def _read(path: Path, options: Mapping[str, Any], scratch: Path) -> Recording:
 def _flag(option: str) -> str:
     """The option as the command has it: names there have no unit."""
     return "--" + option.removesuffix("_m").replace("_", "-")
+
+
+def _with_notes_of_images(recording: Recording) -> Recording:
+    cameras = [camera.name for camera in recording.cameras]
+    unread = notes_of_unread_files(recording.unread_files)
+    return replace(recording, notes=[*recording.notes, *unread, *notes_of_missing_images(cameras, recording.units)])
 
 
 def _with_gnss(recording: Recording, folder: Path, gnss_file: Path | None) -> Recording:

@@ -26,6 +26,7 @@ from mrasfm_engine.importers.recording import (
     interpolated_poses,
 )
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
+from mrasfm_engine.importers.skipped_images import unread_files
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas import Camera, Gnss
@@ -138,6 +139,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         units=units,
         gnss=_gnss(sequence),
         notes=[*NOTES],
+        unread_files={camera.name: unread_files(sequence / "camera" / camera.name) for camera in cameras},
     )
 
 

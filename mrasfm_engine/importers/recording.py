@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import TypeVar
 
 import numpy as np
@@ -74,6 +74,8 @@ class Recording:
     label_map: LabelMap | None = None
     notes: list[str] = field(default_factory=list)
     vehicle: str | None = None
+    # Names of files that are not read, by the folder of images that they lie in; its last part is the camera's name.
+    unread_files: Mapping[str, Sequence[str]] = field(default_factory=dict)
     # Files of images with these keys, in any order, one at a time in memory.
     contents: Callable[[Collection[ImageKey]], Iterator[tuple[ImageKey, bytes]]] | None = None
 
@@ -286,6 +288,7 @@ def select_cameras(recording: Recording, names: Sequence[str] | None) -> Recordi
     return replace(
         recording,
         cameras=[camera for camera in recording.cameras if camera.name in names],
+        unread_files={at: files for at, files in recording.unread_files.items() if PurePath(at).name in names},
         units=[unit for unit in units if unit.images],
     )
 

@@ -19,6 +19,7 @@ from mrasfm_engine.importers.recording import (
     pinhole_params,
     proper_transform,
 )
+from mrasfm_engine.importers.skipped_images import is_image, unread_files
 from mrasfm_engine.importers.tables import read_poses, read_times
 from mrasfm_engine.importers.unknown_fields import notes_of_unknown_fields
 from mrasfm_engine.io.axes import flu_from_body
@@ -31,7 +32,6 @@ from schemas.drive import MAX_CAMERAS, Finite, Name, Vehicle
 
 DESCRIPTION = "rig.json and a folder of numbered images for every camera"
 OPTIONS: tuple[str, ...] = ()
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 DEFAULT_FRAME_INTERVAL_US = 100_000  # where times.txt is missing
 
 _Row3 = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -138,6 +138,7 @@ def read(folder: Path) -> Recording:
         default_gnss=gnss if gnss.exists() else None,
         label_map=LabelMap.cityscapes() if any(masks.values()) else None,
         notes=rig.notes(folder / "rig.json"),
+        unread_files={at: unread_files(folder / at) for name in rig.cameras for at in (name, f"semantics/{name}")},
     )
 
 
@@ -253,7 +254,7 @@ def numbered_images(folder: Path, *, digits: int = 12) -> dict[int, Path]:
                          "camera out of the calibration.", code="missing-folder")  # fmt: skip
     found: dict[int, Path] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in IMAGE_SUFFIXES or file.name.startswith("."):
+        if not is_image(file):
             continue
         if not re.fullmatch(rf"[0-9]{{1,{digits}}}", file.stem):
             raise InputError(

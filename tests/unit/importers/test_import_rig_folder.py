@@ -376,6 +376,41 @@ def test_missing_images_and_masks_are_allowed(recording: Path, tmp_path: Path) -
     assert (summary.units, summary.images, summary.masks) == (8, 15, 14)
 
 
+def test_images_that_an_import_loses_are_noted(recording: Path, tmp_path: Path) -> None:
+    for name in ("000003", "000005", "000006", "000007"):
+        (recording / f"cam_l/{name}.png").rename(recording / f"cam_l/{name}.bmp")
+    (recording / "semantics/cam_r/000003.png").rename(recording / "semantics/cam_r/000003.npy")
+    for aside in ("times.txt", ".DS_Store", "Thumbs.db"):
+        (recording / "cam_r" / aside).write_text("")
+    (recording / "cam_r/more").mkdir()
+    summary = import_recording(recording, tmp_path / "drive")
+    assert summary.images == 12
+    assert summary.notes == [
+        "Files that are not read, as images are .png, .jpg or .jpeg: "
+        "cam_l: 4 (000003.bmp, 000005.bmp, 000006.bmp and 1 more); cam_r: 1 (more/); semantics/cam_r: 1 (000003.npy).",
+        "Frames without an image of a camera: cam_l in 4 of 8 (3, 5, 6 and 1 more).",
+    ]
+    assert read_drive(tmp_path / "drive").manifest.notes == summary.notes
+    chosen = import_recording(recording, tmp_path / "chosen", cameras=["cam_l"], frames="0:3").notes
+    assert [note.partition(": ")[2].partition(":")[0] for note in chosen] == ["cam_l"]
+
+
+def test_notes_of_many_lost_images_fit_a_manifest(recording: Path, tmp_path: Path) -> None:
+    def add(document: dict[str, Any]) -> None:
+        for number in range(40):
+            document["cameras"][f"{'c' * 50}{number:02d}"] = document["cameras"]["cam_l"]
+
+    edit_rig(recording, add)
+    for number in range(40):
+        folder = recording / f"{'c' * 50}{number:02d}"
+        folder.mkdir()
+        for name in "ab":
+            (folder / f"{name * 150}.bmp").write_text("")
+    unread, missing = import_recording(recording, tmp_path / "drive").notes
+    assert unread.endswith("; and 28 more.")
+    assert missing.endswith("; and 28 more.")
+
+
 def test_badly_named_images(recording: Path, tmp_path: Path) -> None:
     shutil.copy(recording / "cam_l/000002.png", recording / "cam_l/2.png")
     assert "both of frame 2" in refused(recording, tmp_path / "drive").what

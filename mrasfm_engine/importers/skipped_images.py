@@ -1,0 +1,60 @@
+"""Notes on images that an import may have lost: files that it did not read, and frames that lack a camera's image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from mrasfm_engine.importers.recording import SourceUnit
+from schemas.findings import listed
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+# Files that recordings and file managers keep beside the images.
+SIDECARS = frozenset({"times.txt", "timestamps.txt", "timestamps.json", "poses.txt", "poses.json", "intrinsics.json",
+                      "readme", "readme.txt", "readme.md", "thumbs.db", "desktop.ini"})  # fmt: skip
+MAX_FOLDERS, MAX_NAMES, MAX_CHARACTERS = 12, 3, 40  # in a note, which a manifest bounds
+
+
+def is_image(path: Path) -> bool:
+    """Return whether a file counts as an image by its name."""
+    return path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")
+
+
+def unread_files(folder: Path) -> list[str]:
+    """Names in a folder of images that are no images, and neither hidden nor known sidecars; folders end in a slash."""
+    if not folder.is_dir():
+        return []
+    others = (path for path in folder.iterdir() if not is_image(path) and not path.name.startswith("."))
+    return sorted(path.name + "/" * path.is_dir() for path in others if path.name.lower() not in SIDECARS)
+
+
+def notes_of_unread_files(unread: Mapping[str, Sequence[str]]) -> list[str]:
+    """A note that counts and names files of folders of images that are not read; none where there are none.
+
+    Parameters
+    ----------
+    unread
+        Names, as `unread_files` finds them, by what the note calls their folder.
+    """
+    shown = {folder: listed([*map(_short, names)], MAX_NAMES) for folder, names in unread.items() if names}
+    parts = [f"{_short(folder)}: {len(unread[folder])} ({names})" for folder, names in shown.items()]
+    return [f"Files that are not read, as images are .png, .jpg or .jpeg: {_joined(parts)}."] if parts else []
+
+
+def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit]) -> list[str]:
+    """A note that counts and names the frames without an image of a camera; none where every camera has all."""
+    parts = []
+    for camera in cameras:
+        frames = [unit.source_frame for unit in units if camera not in unit.images]
+        if frames:
+            parts.append(f"{_short(camera)} in {len(frames)} of {len(units)} ({listed(frames, MAX_NAMES)})")
+    return [f"Frames without an image of a camera: {_joined(parts)}."] if parts else []
+
+
+def _joined(parts: Sequence[str]) -> str:
+    head = "; ".join(parts[:MAX_FOLDERS])
+    return head if len(parts) <= MAX_FOLDERS else f"{head}; and {len(parts) - MAX_FOLDERS} more"
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= MAX_CHARACTERS else name[:MAX_CHARACTERS] + "..."
