@@ -31,6 +31,7 @@ from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
 from schemas.drive import MAX_RIG_EXTENT_M, MAX_VEHICLE_CHARACTERS, VEHICLE_PATTERN
+from schemas.findings import listed
 
 LAYOUTS: tuple[ModuleType, ...] = (
     rig_folder,
@@ -46,6 +47,7 @@ LAYOUTS: tuple[ModuleType, ...] = (
 
 # GNSS samples this long before the first and after the last image are kept: they smooth the ends of the track.
 GNSS_MARGIN_US = 2_000_000
+MAX_RECORDINGS_NAMED = 10  # in a message
 
 
 def import_recording(
@@ -142,13 +144,57 @@ def _read(path: Path, options: Mapping[str, Any], scratch: Path) -> Recording:
                 remedy="Leave it out.",
                 code="unused-option",
             )
+        if path.is_dir():
+            _require_one_recording(path, layout, given.get("scene"))
         recording: Recording = layout.read(path, **given, **({"scratch": scratch} if layout is bags else {}))
         return recording
+    if path.is_dir() and (inside := _recordings_inside(path)):
+        raise _several_recordings(path, inside)
     looked_for = "; ".join(layout.DESCRIPTION for layout in LAYOUTS)
     raise InputError(
         f"the layout of {path} is not known. Looked for: {looked_for}",
         remedy="Give a bag or the folder that holds these files, or write a drive.json: `mrasfm describe manifest`.",
         code="unknown-layout",
+    )
+
+
+def _require_one_recording(path: Path, layout: ModuleType, scene: str | None) -> None:
+    """Refuse a folder around recordings of the layout that is also one around others, unless one is named."""
+    if not any(_is_recognised(layout, folder) for folder in _folders_inside(path)):
+        return  # the folder is the recording
+    inside = _recordings_inside(path)
+    others = [name for name, known in inside.items() if known is not layout]
+    if others and (scene is None or scene in others):
+        raise _several_recordings(path, inside)
+
+
+def _recordings_inside(path: Path) -> dict[str, ModuleType]:
+    """Names of the folders in a folder that are recordings, with their layouts."""
+    found = {}
+    for folder in _folders_inside(path):
+        layout = next((layout for layout in LAYOUTS if _is_recognised(layout, folder)), None)
+        if layout is not None:
+            found[folder.name] = layout
+    return found
+
+
+def _folders_inside(path: Path) -> list[Path]:
+    return sorted(folder for folder in path.iterdir() if folder.is_dir() and not folder.name.startswith("."))
+
+
+def _is_recognised(layout: ModuleType, folder: Path) -> bool:
+    try:
+        return bool(layout.recognises(folder))
+    except (OSError, InputError):
+        return False  # as a folder that cannot be listed
+
+
+def _several_recordings(path: Path, inside: Mapping[str, ModuleType]) -> InputError:
+    named = listed([f"{name} ({layout.DESCRIPTION})" for name, layout in inside.items()], MAX_RECORDINGS_NAMED)
+    return InputError(
+        f"{path} is a folder around recordings: {named}",
+        remedy=f"Give one of them, as {path / next(iter(inside))}.",
+        code="several-recordings",
     )
 
 

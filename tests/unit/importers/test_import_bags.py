@@ -552,7 +552,9 @@ def test_sensors_of_fewer_bits_in_16(tmp_path: Path, bits: int, encoding: str) -
     if encoding == "mono16":
         assert np.array_equal(found, values << 4)
     assert 100 < read_image_gray(drive.root / drive.images[0].file).mean() < 230
-    assert sum("of 16 bits" in note for note in summary.notes) == 1  # of the right camera's 8 bits there is nothing to say
+    assert (
+        sum("of 16 bits" in note for note in summary.notes) == 1
+    )  # of the right camera's 8 bits there is nothing to say
 
 
 def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:

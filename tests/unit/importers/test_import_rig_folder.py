@@ -571,6 +571,27 @@ def test_unknown_layout_lists_what_was_looked_for(tmp_path: Path) -> None:
     assert refused(tmp_path / "nowhere", tmp_path / "drive").code == "missing-folder"
 
 
+def test_a_folder_around_recordings_of_several_layouts(recording: Path, tmp_path: Path) -> None:
+    around = tmp_path / "around"
+    around.mkdir()
+    (recording / "semantics").rename(tmp_path / "semantics")
+    recording.rename(around / "street")
+    error = refused(around, tmp_path / "drive")  # of one, which the folder around it is not
+    assert error.code == "several-recordings"
+    assert "street (rig.json" in error.what
+    assert str(around / "street") in error.remedy
+    for name in ("lidar", "camera"):
+        (around / "001" / name).mkdir(parents=True)
+    (around / "001/lidar/poses.json").write_text("[]")
+    error = refused(around, tmp_path / "drive")
+    assert error.code == "several-recordings"
+    assert "001 (" in error.what
+    assert "street (rig.json" in error.what
+    assert refused(around, tmp_path / "drive", scene="street").code == "several-recordings"
+    assert "lidar/timestamps.json" in refused(around, tmp_path / "drive", scene="001").what  # that one is read
+    assert import_recording(around / "street", tmp_path / "drive").units == 8
+
+
 def command(*words: str) -> int:
     parser = argparse.ArgumentParser()
     import_drive.register(parser.add_subparsers())
