@@ -20,6 +20,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.preflight.drive_reader import read_drive
+from schemas.command_line import output_folder
 
 if TYPE_CHECKING:
     from mrasfm_engine.ablation import Row
@@ -47,7 +48,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         metavar="FILE",
         help=f"true poses of the cameras in the rig (default: {TRUE_CALIBRATION} beside the truth, else as given)",
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help=f"keep stages and {RESULT} in this folder")
+    parser.add_argument("--out", type=output_folder, metavar="DIR", help=f"keep stages and {RESULT} in this folder")
     parser.add_argument(
         "--only",
         action="append",

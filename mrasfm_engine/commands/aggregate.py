@@ -13,6 +13,7 @@ from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, print_report
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
+from schemas.command_line import output_folder
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +26,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "scenes", nargs="*", metavar="SCENE", help="folders that `mrasfm reconstruct` wrote, or NAME=FOLDER"
     )
-    parser.add_argument("--out", type=Path, metavar="MAP", help="folder for the map; with --into by default that one")
+    parser.add_argument(
+        "--out", type=output_folder, metavar="MAP", help="folder for the map; with --into by default that one"
+    )
     parser.add_argument("--into", type=Path, metavar="MAP", help="add the scenes to this map")
     parser.add_argument("--remove", action="append", default=[], metavar="NAME", help="take a scene out of the map")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")

@@ -12,6 +12,7 @@ from rich.console import Console
 from mrasfm_engine.commands.work_folder import work_folder, write_document
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
+from schemas.command_line import output_folder
 
 RESULT = "bench.json"
 DEFAULT_UNITS = "100"
@@ -69,7 +70,9 @@ def register(subparsers: Any) -> None:
     )
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
-    parser.add_argument("--out", type=Path, metavar="DIR", help=f"keep features, matches and {RESULT} in this folder")
+    parser.add_argument(
+        "--out", type=output_folder, metavar="DIR", help=f"keep features, matches and {RESULT} in this folder"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
     parser.set_defaults(run=run)
 

@@ -15,6 +15,7 @@ from mrasfm_engine.commands.named_path import split_name
 from mrasfm_engine.commands.reconstruct import cancel_on_interrupt
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.errors import InputError
+from schemas.command_line import output_folder
 from schemas.exports import EXPORT_FORMATS
 
 EXIT_WITHHELD = 1
@@ -38,7 +39,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         dest="formats",
         help=f"format, may be repeated: {', '.join(EXPORT_FORMATS)}",
     )
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the export")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="OUT", help="folder for the export")
     parser.add_argument(
         "--drive",
         action="append",

@@ -11,6 +11,7 @@ from typing import Any
 
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.importers.recording import RoughQuality
+from schemas.command_line import output_folder
 
 OPTIONS = (
     "forward_camera",
@@ -36,7 +37,7 @@ def register(subparsers: Any) -> None:
         "rig_config.json, or a ROS bag (ROS 1, or ROS 2 in MCAP or SQLite).",
     )
     parser.add_argument("folder", type=Path, metavar="RECORDING", help="the recording: a folder, or a bag's file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DRIVE", help="folder of the drive")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="DRIVE", help="folder of the drive")
     parser.add_argument(
         "--frames",
         metavar="START:STOP:STEP",

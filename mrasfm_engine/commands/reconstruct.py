@@ -18,6 +18,7 @@ from rich.console import Console
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from schemas.artifacts import REPORT_FILE, component_folder
+from schemas.command_line import output_folder
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -28,7 +29,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Turn a drive into a scene. An interrupted reconstruction goes on from its last finished stage.",
     )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for the scene")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="OUT", help="folder for the scene")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
     parser.add_argument("--json", action="store_true", help="print report.json instead of a summary")

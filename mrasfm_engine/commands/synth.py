@@ -6,12 +6,12 @@ import argparse
 import json
 from dataclasses import fields
 from functools import partial
-from pathlib import Path
 
 from rich.console import Console
 
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions, World
+from schemas.command_line import output_folder
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -19,7 +19,9 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "synth", help="render a drive with ground truth", description="Render drives of a synthetic world."
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the drive (of the drives, if several)")
+    parser.add_argument(
+        "--out", type=output_folder, required=True, help="folder of the drive (of the drives, if several)"
+    )
     parser.add_argument("--force", action="store_true", help="replace what is in --out")
     default = SynthOptions()
 

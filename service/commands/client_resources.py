@@ -6,9 +6,9 @@ import argparse
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from schemas.command_line import output_folder
 from schemas.exports import EXPORT_FORMATS
 from service.commands.client_common import CommandSummary, Conversation, add_command, run_command
 
@@ -49,7 +49,7 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument("id", metavar="JOB", help="id of the job")
     parser = _command(subparsers, "download", "download a scene, a map or an export", _download, has_out=True)
     parser.add_argument("id", metavar="ID", help="id of a scene or export; of a map MAP or MAP/VERSION")
-    parser.add_argument("--out", type=Path, required=True, metavar="OUT", help="folder for its files")
+    parser.add_argument("--out", type=output_folder, required=True, metavar="OUT", help="folder for its files")
     parser = _command(subparsers, "export", "get a scene or map in formats of other programs", _export, has_out=True)
     parser.add_argument("id", metavar="ID", help="id of a scene; of a map MAP or MAP/VERSION")
     parser.add_argument(
@@ -64,7 +64,7 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument("--image-size", type=int, metavar="PX", help="scale images down to this longest side")
     parser.add_argument("--crs", metavar="EPSG:CODE", help="coordinate reference system, for formats that take one")
     parser.add_argument("--component", type=int, metavar="N", help="of a scene: export its components/N in its place")
-    parser.add_argument("--out", type=Path, metavar="OUT", help="folder for its files; waits for them")
+    parser.add_argument("--out", type=output_folder, metavar="OUT", help="folder for its files; waits for them")
     parser = _command(subparsers, "webhook", "register an address that is told when jobs end", _webhook)
     parser.add_argument("address", metavar="ADDRESS", help="https address that takes POST requests")
     parser.add_argument("--event", action="append", dest="events", metavar="EVENT", help="job.succeeded, job.failed or "

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from schemas.artifacts import drive_of_scene
+from schemas.command_line import output_folder
 
 if TYPE_CHECKING:
     from service.client import Client
@@ -48,7 +49,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         "2 OUT is not empty",
     )
     parser.add_argument(
-        "--out", type=Path, default=Path("demo"), metavar="OUT", help="folder for all output (default: demo)"
+        "--out", type=output_folder, default=Path("demo"), metavar="OUT", help="folder for all output (default: demo)"
     )
     parser.add_argument("--units", type=int, default=20, help="frames of each drive (default: 20)")
     parser.set_defaults(run=run)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from schemas.command_line import output_folder
 from service.commands.client_common import CommandSummary, Conversation, add_command, run_command
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         description="Send drives to a service, reconstruct those without a scene there, and download one map of all.",
     )
     parser.add_argument("drives", type=Path, nargs="*", metavar="DRIVE", help="folders with drive.json")
-    parser.add_argument("--out", type=Path, metavar="OUT", help="folder for the map")
+    parser.add_argument("--out", type=output_folder, metavar="OUT", help="folder for the map")
     parser.add_argument("--into", metavar="MAP_ID", help="make a new version of this map instead of a new map")
     parser.add_argument(
         "--remove", action="append", default=[], metavar="ID", help="drive or scene that the new version leaves out"

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from schemas.command_line import output_folder
 from service.commands.client_common import CommandSummary, Conversation, add_command, lines_of, run_command
 
 
@@ -32,7 +33,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     )
     parser.add_argument("drive", type=Path, metavar="DRIVE", help="folder with drive.json")
     parser.add_argument("--wait", action="store_true", help="wait until the scene is there")
-    parser.add_argument("--out", type=Path, metavar="OUT", help="folder for the scene; waits for it")
+    parser.add_argument("--out", type=output_folder, metavar="OUT", help="folder for the scene; waits for it")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
     parser.set_defaults(run=run)
 

@@ -18,6 +18,7 @@ from mrasfm_engine.cli import HEADINGS, build_parser, main
 from mrasfm_engine.commands.completion import FOLDER
 from mrasfm_engine.commands.open import page_of
 from mrasfm_engine.errors import InputError
+from service.commands import client_program
 
 HELP_CPU_S = 0.2
 # Commands that run until they are stopped, print a text, or change one thing.
@@ -77,6 +78,30 @@ def test_results_can_be_had_as_json() -> None:
 
     lacking = {name for name, parser in commands().items() if not has_it(parser)}
     assert lacking == WITHOUT_JSON
+
+
+def test_no_result_goes_to_a_folder_without_a_name() -> None:
+    """A shell makes an empty word of a variable that is not set, and a path the working directory of that."""
+
+    def outputs(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+        nested = [p for a in parser._actions if isinstance(a, argparse._SubParsersAction) for p in a.choices.values()]
+        own = [action for action in parser._actions if "--out" in action.option_strings]
+        return [*own, *(action for each in nested for action in outputs(each))]
+
+    found = [action for parser in [*commands().values(), client_program.build_parser()] for action in outputs(parser)]
+    assert len(found) >= 13
+    for action in found:
+        assert callable(action.type)
+        assert action.type(".") == Path()
+        with pytest.raises(argparse.ArgumentTypeError, match="no folder is given"):
+            action.type("")
+
+
+def test_an_empty_folder_is_refused_before_anything_is_read(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["reconstruct", "no drive", "--out", ""])
+    assert ended.value.code == 2
+    assert "argument --out: no folder is given" in capsys.readouterr().err
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
