@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import Row, Rows
-from mrasfm_engine.export.contract import ExportSource, ExportWork, Written
+from mrasfm_engine.export.contract import ExportOptions, ExportSource, ExportWork, Written
 from mrasfm_engine.export.projection_readback import projected
 from mrasfm_engine.geometry import utm
 from mrasfm_engine.geometry.earth_system import EarthSystem, named_system
@@ -67,6 +67,15 @@ class Picture(NamedTuple):
         return np.unique((places[:, None] + around).reshape(-1, 2), axis=0) * float(side)
 
 
+class PlacedPicture(NamedTuple):
+    """A picture and its place in a coordinate reference system."""
+
+    picture: Picture
+    system: EarthSystem
+    system_from_pixel: Floats
+    off_cells: float
+
+
 def write_geotiff_in_crs(work: ExportWork) -> Written:
     """Write `road.tif`; the scene must be georeferenced.
 
@@ -76,10 +85,28 @@ def write_geotiff_in_crs(work: ExportWork) -> Written:
         Where the scene has no picture of its road, or is too large for an affine map.
     """
     source = work.source
+    picture, system, system_from_pixel, off_cells = placed_picture(source, work.options)
+    digest = _write(picture, work.folder / FILE, system_from_pixel, system)
+    compare = partial(_compare, source, picture, system.name)
+    notes = [
+        f"coordinates are in {system.name.partition('+')[0]}; cells are off by up to {off_cells:.2g} cells",
+        *system.notes(),
+    ]
+    return Written(checks=[Check(FILE, read_picture, compare)], digests={FILE: digest}, notes=notes)
+
+
+def placed_picture(source: ExportSource, options: ExportOptions) -> PlacedPicture:
+    """The picture of a georeferenced scene in a system, by default in UTM.
+
+    Raises
+    ------
+    InputError
+        As `write_geotiff_in_crs` does: before anything is written this tells whether it can be.
+    """
     picture = _picture(source)
     place = source.scene.georeference
     assert place is not None
-    system = named_system(work.options.crs or f"EPSG:{utm.epsg_code(*place.origin_deg)}", at=place.origin_deg)
+    system = named_system(options.crs or f"EPSG:{utm.epsg_code(*place.origin_deg)}", at=place.origin_deg)
     pixels = picture.corners()
     places = system.projected(on_the_ground(source, picture, pixels), place.ecef_from_local)[:, :2]
     system_from_pixel, off_cells = _fitted(pixels, places)
@@ -90,13 +117,7 @@ def write_geotiff_in_crs(work: ExportWork) -> Written:
             remedy=f"Warp the scene's own {ROAD_TIFF_FILE} with gdalwarp -t_srs {system.name.partition('+')[0]}.",
             code="too-far",
         )
-    digest = _write(picture, work.folder / FILE, system_from_pixel, system)
-    compare = partial(_compare, source, picture, system.name)
-    notes = [
-        f"coordinates are in {system.name.partition('+')[0]}; cells are off by up to {off_cells:.2g} cells",
-        *system.notes(),
-    ]
-    return Written(checks=[Check(FILE, read_picture, compare)], digests={FILE: digest}, notes=notes)
+    return PlacedPicture(picture, system, system_from_pixel, off_cells)
 
 
 def _picture(source: ExportSource) -> Picture:

@@ -16,10 +16,11 @@ from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, Storag
 from mrasfm_engine.export.check import ReadBack
 from mrasfm_engine.export.contract import DriveFiles, ExportOptions, ExportSource, ExportWork, Written
 from mrasfm_engine.export.file_contents import sha256
-from mrasfm_engine.export.formats import WRITERS
+from mrasfm_engine.export.formats import CHECKS, WRITERS
 from mrasfm_engine.export.publishing import publishing, while_nothing_moves
 from mrasfm_engine.export.scene import write_json
 from mrasfm_engine.export.stored_scene import read_source
+from mrasfm_engine.geometry.earth_system import named_system
 from mrasfm_engine.io.stage_store import fingerprints_of_images, sha256_of_files
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
@@ -257,6 +258,17 @@ def _check_needs(request: ExportRequest, source: ExportSource) -> None:
                 else "Give --drive DRIVE, the folder with drive.json.",
                 code="drive-needed",
             )
+    place = source.scene.georeference
+    # Writers refuse these too, but after others have written for minutes what is then lost.
+    if request.options.crs is not None and place is not None:
+        named_system(request.options.crs, at=place.origin_deg)
+    for check in (CHECKS[name] for name in request.formats if name in CHECKS):
+        try:
+            check(source, request.options)
+        except MrasfmError:
+            raise
+        except Exception:
+            continue  # a defect, which withholds the format where its writer meets it, and leaves the others
 
 
 def _drive_files(request: ExportRequest, source: ExportSource) -> DriveFiles:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.errors import CancelledError, InputError, MrasfmError, StorageError
+from mrasfm_engine.export import copc as exports_of_points
 from mrasfm_engine.export import run_export as exports
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.comparisons import nothing
@@ -217,6 +218,31 @@ def test_what_a_scene_does_not_have_is_refused_by_name(scene_folder: Path, tmp_p
     points = scene_folder / "model" / "points3D.bin"
     points.write_bytes(points.read_bytes()[:-9])
     assert not (tmp_path / "out").exists()
+
+
+def test_what_a_scene_does_not_have_is_refused_before_anything_is_written(
+    scene_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[str] = []
+
+    def writer(work: ExportWork) -> Written:
+        begun.append(work.folder.name)
+        (work.folder / "poses.txt").touch()
+        return Written(checks=[Check("poses.txt", Path.read_bytes, nothing)])
+
+    monkeypatch.setitem(WRITERS, "kitti", writer)
+    with pytest.raises(InputError, match=r"has no pictures/road.tif") as found:
+        _exported(scene_folder, "kitti", "geotiff")
+    assert found.value.code == "no-picture"
+    for crs in ("EPSG:1", "EPSG:4326", "EPSG:2263"):  # unknown, in degrees, of another continent
+        with pytest.raises(InputError, match="EPSG:") as found:
+            _exported(scene_folder, "kitti", "geopackage", crs=crs)
+        assert found.value.code in ("bad-crs", "outside-crs")
+    monkeypatch.setattr(exports_of_points, "fits", lambda scene: False)
+    with pytest.raises(InputError, match="do not fit into a COPC"):
+        _exported(scene_folder, "kitti", "copc")
+    assert not begun
+    assert not (scene_folder.parent / "out").exists()
 
 
 def test_an_export_removes_nothing_that_no_export_has_made(scene_folder: Path, tmp_path: Path) -> None:
