@@ -211,12 +211,18 @@ class Settings(BaseSettings):
         return value
 
     @property
+    def database_file(self) -> Path:
+        """The database of a service that keeps all its state in the data folder."""
+        return self.data_dir.resolve() / "mrasfm.sqlite3"
+
+    @property
     def resolved_database_url(self) -> str:
         """The database's URL, with the embedded one in its place where none is set."""
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        path = str(self.data_dir.resolve() / "mrasfm.sqlite3")
-        return URL.create("sqlite", database=path).render_as_string()  # quoted: a folder may be named `a?b`
+        return URL.create(
+            "sqlite", database=str(self.database_file)
+        ).render_as_string()  # quoted: a folder may be named `a?b`
 
     @property
     def tile_origin(self) -> str | None:

@@ -228,6 +228,8 @@ _shtab_mrasfm_keys_create_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--project[project that the key opens\; created if it does not exist (default\: default)]:project:"
   "--name[label of the key in lists (default\: unnamed)]:name:"
+  "--data[state of a standalone service (MRASFM_DATA_DIR)]:DIR:"
+  "--json[print JSON]"
 )
 
 # guard to ensure default positional specs are added only once per session
@@ -235,6 +237,8 @@ _shtab_mrasfm_keys_create_defaults_added=0
 
 _shtab_mrasfm_keys_list_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
+  "--data[state of a standalone service (MRASFM_DATA_DIR)]:DIR:"
+  "--json[print JSON]"
 )
 
 # guard to ensure default positional specs are added only once per session
@@ -242,6 +246,8 @@ _shtab_mrasfm_keys_list_defaults_added=0
 
 _shtab_mrasfm_keys_revoke_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
+  "--data[state of a standalone service (MRASFM_DATA_DIR)]:DIR:"
+  "--json[print JSON]"
   ":id of the key, as mrasfm keys list prints it:"
 )
 
@@ -339,6 +345,8 @@ _shtab_mrasfm_projects_defaults_added=0
 
 _shtab_mrasfm_projects_list_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
+  "--data[state of a standalone service (MRASFM_DATA_DIR)]:DIR:"
+  "--json[print JSON]"
 )
 
 # guard to ensure default positional specs are added only once per session
@@ -349,6 +357,8 @@ _shtab_mrasfm_projects_set_options=(
   "--max-bytes[bytes that the project stores]:N:"
   "--max-active-jobs[jobs that are queued or running at one time]:N:"
   "--max-drives[drives at one time]:N:"
+  "--data[state of a standalone service (MRASFM_DATA_DIR)]:DIR:"
+  "--json[print JSON]"
   ":name of the project:"
 )
 

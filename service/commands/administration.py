@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,27 +18,54 @@ EXIT_CANNOT_RUN = 2
 Action = Callable[["Session", Settings, argparse.Namespace], int]
 
 
-def add_data(parser: argparse.ArgumentParser) -> None:
-    """Add the argument that says which service."""
-    parser.add_argument("--data", type=Path, metavar="DIR", help="state of a standalone service (MRASFM_DATA_DIR)")
+def add_options(parser: argparse.ArgumentParser, actions: Iterable[argparse.ArgumentParser]) -> None:
+    """Add the arguments that say which service, and ask for a form that programs read: before and after an action."""
+    _add(parser, data=None, json=False)
+    for action in actions:
+        # Without a default: it would overwrite what stands before the action.
+        _add(action, data=argparse.SUPPRESS, json=argparse.SUPPRESS)
 
 
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """Add the argument that asks for a form that programs read."""
-    parser.add_argument("--json", action="store_true", help="print JSON")
+def _add(parser: argparse.ArgumentParser, *, data: str | None, json: str | bool) -> None:
+    state = "state of a standalone service (MRASFM_DATA_DIR)"
+    parser.add_argument("--data", type=Path, metavar="DIR", default=data, help=state)
+    parser.add_argument("--json", action="store_true", default=json, help="print JSON")
 
 
-def administer(action: Action, arguments: argparse.Namespace) -> int:
-    """Run an action in one transaction on the service's records; its exit code."""
+def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool = False) -> int:
+    """Run an action in one transaction on the service's records; its exit code.
+
+    Parameters
+    ----------
+    may_begin
+        Whether the action makes sense before the service has started for the first time.
+    """
     from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
 
-    settings = Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+    settings = settings_of(arguments)
+    if not may_begin and not holds_state(settings):
+        print(
+            f"mrasfm: error: {settings.data_dir.resolve()} holds no state of a service. Give --data and the folder "
+            "that mrasfm standalone was started with.",
+            file=sys.stderr,
+        )
+        return EXIT_CANNOT_RUN
     try:
         with unusable_is_told(settings):
             return _in_transaction(action, settings, arguments)
     except UnusableDatabaseError as error:
         print(f"mrasfm: error: {error}", file=sys.stderr)
         return EXIT_CANNOT_RUN
+
+
+def settings_of(arguments: argparse.Namespace) -> Settings:
+    """The settings of the service that the arguments name."""
+    return Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+
+
+def holds_state(settings: Settings) -> bool:
+    """Return whether a service's records are there; those of a database server are."""
+    return settings.database_url is not None or settings.database_file.exists()
 
 
 def _in_transaction(action: Action, settings: Settings, arguments: argparse.Namespace) -> int:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from typing import TYPE_CHECKING
 
-from service.commands.administration import add_data, add_json, administer
+from service.commands.administration import add_options, administer, holds_state, settings_of
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
@@ -20,8 +21,6 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "keys", help="create, list and revoke API keys", description="Create, list and revoke API keys."
     )
-    add_data(parser)
-    add_json(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
     create = actions.add_parser("create", help="create a key and print it")
     create.add_argument(
@@ -30,15 +29,39 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
         help="project that the key opens; created if it does not exist (default: default)",
     )
     create.add_argument("--name", default="unnamed", help="label of the key in lists (default: unnamed)")
-    actions.add_parser("list", help="list keys, without their secrets")
+    listing = actions.add_parser("list", help="list keys, without their secrets")
     revoke = actions.add_parser("revoke", help="revoke a key")
     revoke.add_argument("key_id", metavar="ID", help="id of the key, as mrasfm keys list prints it")
+    add_options(parser, (create, listing, revoke))
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what is asked; a key is printed once and not kept."""
+    if arguments.action == "create":
+        return _create_and_say_where(arguments)
     return administer(_ACTIONS[arguments.action], arguments)
+
+
+def _create_and_say_where(arguments: argparse.Namespace) -> int:
+    """Create a key, and say which service it is for: another folder's service would answer it with 401."""
+    settings = settings_of(arguments)
+    is_first = not holds_state(settings)
+    code = administer(_create, arguments, may_begin=True)
+    if code != 0:
+        return code
+    if settings.database_url is not None:
+        told = "the key is for the service with the database of MRASFM_DATABASE_URL"
+    elif is_first:
+        folder = settings.data_dir.resolve()
+        told = (
+            f"warning: {folder} held no state of a service. The key is for one that is started with mrasfm standalone "
+            f"--data {shlex.quote(str(folder))}; for one that runs already, give --data and its folder"
+        )
+    else:
+        told = f"the key is for the service with its state in {settings.data_dir.resolve()}"
+    print(f"mrasfm: {told}.", file=sys.stderr)
+    return code
 
 
 def _create(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:

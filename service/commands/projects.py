@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import TypeAdapter, ValidationError
 
-from service.commands.administration import add_data, add_json, administer
+from service.commands.administration import add_options, administer
 from service.settings import Bytes, Count, Settings
 
 if TYPE_CHECKING:
@@ -28,14 +28,13 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser = subparsers.add_parser(
         "projects", help="list projects and change their quotas", description="List projects and change their quotas."
     )
-    add_data(parser)
-    add_json(parser)
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    actions.add_parser("list", help="list projects with what they use of their quotas")
+    listing = actions.add_parser("list", help="list projects with what they use of their quotas")
     change = actions.add_parser("set", help="change quotas of a project; what it has already stays")
     change.add_argument("name", metavar="NAME", help="name of the project")
     for quota, (kind, what) in _QUOTAS.items():
         change.add_argument(_option(quota), type=_number(kind), metavar="N", help=what)
+    add_options(parser, (listing, change))
     parser.set_defaults(run=run)
 
 

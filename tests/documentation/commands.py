@@ -85,7 +85,7 @@ def _form(action: argparse.Action) -> str:
 
 def _meaning(action: argparse.Action) -> str:
     text = (action.help or "") % {**vars(action), "prog": "mrasfm"}
-    has_default = isinstance(action.default, int | float | str) and action.default != ""
+    has_default = isinstance(action.default, int | float | str) and action.default not in ("", argparse.SUPPRESS)
     if has_default and "default" not in text and action.nargs != 0:
         text += f" (default: {action.default})"
     return ("required: " if action.required and action.option_strings else "") + _escaped(text)

@@ -1,12 +1,14 @@
-"""`mrasfm projects`: what an operator does where a quota is full."""
+"""`mrasfm projects` and `mrasfm keys`: records of a service, as its operator changes them."""
 
 from __future__ import annotations
 
 import argparse
+import json
+from pathlib import Path
 
 import pytest
 
-from service.commands import projects
+from service.commands import keys, projects
 from tests.helpers.live_api import Api, problem_of
 from tests.helpers.tiny_drive import tiny_drive
 
@@ -52,3 +54,47 @@ def test_quotas_are_whole_numbers_that_the_database_holds(
         with pytest.raises(SystemExit):
             run(api, "set", "nobody", f"{option}={value}")
         assert f"{value!r}" in capsys.readouterr().err
+
+
+def mrasfm(*arguments: str) -> int:
+    parser = argparse.ArgumentParser(prog="mrasfm")
+    subparsers = parser.add_subparsers()
+    for command in (keys, projects):
+        command.register(subparsers)
+    parsed = parser.parse_args(arguments)
+    return int(parsed.run(parsed))
+
+
+@pytest.mark.parametrize(
+    "asked", [("keys", "list"), ("keys", "revoke", "key_1"), ("projects", "list"), ("projects", "set", "a")]
+)
+def test_a_folder_without_a_service_is_refused_and_not_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], asked: tuple[str, ...]
+) -> None:
+    command, *rest = asked
+    assert mrasfm(command, "--data", str(tmp_path / "typo"), *rest) == 2
+    told = capsys.readouterr().err
+    assert f"{tmp_path / 'typo'} holds no state of a service" in told
+    assert "Give --data" in told
+    assert not (tmp_path / "typo").exists()
+
+
+def test_a_new_key_says_which_service_it_is_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = str(tmp_path / "state")
+    assert mrasfm("keys", "--data", folder, "create") == 0, "also before the service has started"
+    first = capsys.readouterr()
+    assert first.out.startswith("mrasfm_")
+    assert f"{folder} held no state" in first.err
+    assert f"mrasfm standalone --data {folder}" in first.err
+    assert mrasfm("keys", "--data", folder, "create") == 0
+    assert capsys.readouterr().err == f"mrasfm: the key is for the service with its state in {folder}.\n"
+
+
+def test_options_may_come_after_the_action(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = str(tmp_path / "state")
+    assert mrasfm("keys", "create", "--data", folder, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["project"] == "default"
+    assert mrasfm("keys", "--json", "list", "--data", folder) == 0
+    assert [key["name"] for key in json.loads(capsys.readouterr().out)] == ["unnamed"]
+    assert mrasfm("projects", "--data", folder, "list", "--json") == 0
+    assert [project["name"] for project in json.loads(capsys.readouterr().out)] == ["default"]
