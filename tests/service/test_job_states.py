@@ -360,6 +360,23 @@ def test_a_job_that_was_cancelled_while_it_ran_never_runs_again(database: Databa
     assert claim(database, job_id) is None
 
 
+@pytest.mark.parametrize("how", ["cancelled", "failed", "waits again"])
+def test_what_does_not_run_has_no_time_to_go(database: Database, job_id: str, how: str) -> None:
+    held = claimed(database, job_id)
+    note = dataclasses.replace(note_of(50.0), eta_low_s=60.0, eta_high_s=90.0)
+    with database.write() as session:
+        jobs.heartbeat(session, held, lease_us=LEASE_US, note=note)
+    assert job_of(database, job_id).eta_low_s == 60.0
+    if how == "cancelled":
+        cancel(database, job_id)
+        with database.write() as session:
+            jobs.cancelled(session, held)
+    else:
+        fail(database, held, retryable=how == "waits again")
+    job = job_of(database, job_id)
+    assert (job.eta_low_s, job.eta_high_s, job.percent) == (None, None, 50.0)
+
+
 def test_a_lost_worker_of_a_cancelled_job(database: Database, job_id: str) -> None:
     claimed(database, job_id)
     cancel(database, job_id)

@@ -73,6 +73,8 @@ def require(changed: bool) -> None:
 
 
 def change(session: Session, job_id: str, condition: ColumnElement[bool], values: Mapping[str, Any]) -> bool:
+    if "state" in values:  # an estimate is of the state before: nothing goes on that has ended, or waits again
+        values = {"eta_low_s": None, "eta_high_s": None, **values}
     statement = update(Job).where(Job.id == job_id, Job.state.not_in(TERMINAL), condition)
     statement = statement.values(**values, revision=Job.revision + 1).execution_options(synchronize_session=False)
     return bool(session.execute(statement).rowcount)  # type: ignore[attr-defined]
