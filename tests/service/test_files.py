@@ -141,6 +141,36 @@ def test_what_is_no_image_of_a_camera(client: Client, drive: TinyDrive, drive_id
     assert len(client.api.objects(client.project_id)) == 1, "only the manifest"
 
 
+def test_a_form_is_named_as_what_is_wrong(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    """`curl -F file=@x.png` sends a good file as a part of something else."""
+    path, data = next(iter(drive.files.items()))
+    for where, part, status, code in (
+        (f"files/{path}", data, 422, "not-an-image"),
+        ("archive", drive.zipped(), 415, "not-an-archive"),
+    ):
+        url = f"/v1/drives/{drive_id}/{where}"
+        problem = problem_of(client.put(url, files={"file": part}), status, code)
+        assert "form (multipart/form-data)" in problem["detail"]
+        assert "--data-binary" in problem["remedy"]
+        headers = {"Content-Digest": digest(part)}
+        problem = problem_of(client.put(url, files={"file": part}, headers=headers), 422, "wrong-digest")
+        assert "form" in problem["detail"]
+    raw = client.put(f"/v1/drives/{drive_id}/files/{path}", content=data, headers={"Content-Type": "multipart/x"})
+    assert raw.status_code == 201, "the bytes count"
+
+
+def test_a_file_that_is_not_here_yet(client: Client, drive: TinyDrive, drive_id: str) -> None:
+    path, data = next(iter(drive.files.items()))
+    problem = problem_of(client.get(f"/v1/drives/{drive_id}/files/{path}"), 404, "not-found")
+    assert f"{path!r} of drive {drive_id} is not uploaded yet" in problem["detail"]
+    assert f"PUT /v1/drives/{drive_id}/files/{path}" in problem["remedy"]
+    put(client, drive_id, path, data)
+    assert client.get(f"/v1/drives/{drive_id}/files/{path}").content == data
+    for other in ("no.png", "drive.json", "a%00b"):
+        problem = problem_of(client.get(f"/v1/drives/{drive_id}/files/{other}"), 404, "not-found")
+        assert "names no file" in problem["detail"]
+
+
 def test_bytes_that_are_not_those_announced(client: Client, drive: TinyDrive, drive_id: str) -> None:
     path, data = next(iter(drive.files.items()))
     problem_of(put(client, drive_id, path, data, digest=digest(b"other")), 422, "wrong-digest")

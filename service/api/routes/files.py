@@ -28,7 +28,7 @@ from service.database.tables import Blob, DriveFile
 from service.digests import parse_digest
 from service.domain import drive_files, drives
 from service.domain.idempotency import Answer
-from service.errors import PartialBody, ServiceError
+from service.errors import ImageRefused, NotAnArchive, PartialBody, ServiceError, WrongDigest
 from service.storage.spool import receive, receive_into
 
 router = APIRouter(prefix="/v1/drives/{drive_id}", tags=["files"])
@@ -133,8 +133,9 @@ async def put_file(
             max_bytes=context.settings.max_file_bytes,
             **announced,
         )
-    except ServiceError:
+    except ServiceError as error:
         await _drain(request, stream)
+        _refuse_form(request, error)
         raise
     response.status_code = 201 if new else 200
     return shown
@@ -188,12 +189,17 @@ async def put_archive(
             look=watch.look,
             **announced,
         )
-    except ServiceError:
+    except ServiceError as error:
         await _drain(request, stream)
+        _refuse_form(request, error)
         raise
     with archive:
         unpacking = partial(keep_archive, context, caller.project_id, drive_id, archive, replace)
-        return await anyio.to_thread.run_sync(unpacking, limiter=context.unpacking)
+        try:
+            return await anyio.to_thread.run_sync(unpacking, limiter=context.unpacking)
+        except ServiceError as error:
+            _refuse_form(request, error)
+            raise
 
 
 class _Announced(TypedDict):
@@ -218,6 +224,23 @@ def _announced(request: Request, context: Context) -> _Announced:
         "min_free_bytes": context.settings.min_free_disk_bytes,
         "on_disk": context.disk,
     }
+
+
+def _refuse_form(request: Request, error: ServiceError) -> None:
+    """Refuse the form that holds a good file in the words of forms, not of the file: it is the body that is wrong.
+
+    Raises
+    ------
+    ServiceError
+        Of the same kind as `error`, where that is about the body's bytes and the body is a form.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind.startswith("multipart/") and isinstance(error, ImageRefused | NotAnArchive | WrongDigest):
+        raise type(error)(
+            f"the body is a form ({kind}), in which the file is one part",
+            remedy="Send the file's bytes alone: with curl --data-binary @FILE or -T FILE, not -F.",
+            code=error.code,
+        ) from error
 
 
 async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
