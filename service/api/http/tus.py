@@ -19,7 +19,9 @@ CONTENT_TYPE = "application/offset+octet-stream"
 ALGORITHMS = ("sha1", "sha256")
 MAX_METADATA = 8192
 
-_NUMBER = re.compile(r"[0-9]{1,18}", re.ASCII)
+_MAX_DIGITS = 18  # of a number that databases hold
+_NUMBER = re.compile(rf"[0-9]{{1,{_MAX_DIGITS}}}", re.ASCII)
+_DIGITS = re.compile(r"[0-9]+", re.ASCII)
 _SHA256 = re.compile(r"[0-9a-f]{64}", re.ASCII)
 
 
@@ -40,8 +42,9 @@ def require_version(given: str | None) -> None:
         412.
     """
     if given != VERSION:
+        was = "missing" if given is None else repr(given[:40])
         raise TusVersion(
-            f"the header Tus-Resumable is {given!r}, this service speaks {VERSION}",
+            f"the header Tus-Resumable is {was}, this service speaks {VERSION}",
             remedy=f"Send Tus-Resumable: {VERSION}.",
             headers={"Tus-Version": VERSION},
         )
@@ -55,8 +58,14 @@ def parse_number(name: str, given: str | None) -> int:
     ServiceError
         400 where it is missing or no number of bytes.
     """
-    if given is None or not _NUMBER.fullmatch(given):
-        raise malformed(f"{name} is {given!r}", f"Send {name}: and a whole number of bytes.")
+    remedy = f"Send {name}: and a whole number of bytes."
+    if given is None:
+        raise malformed(f"the header {name} is missing", remedy)
+    if not _NUMBER.fullmatch(given):
+        if _DIGITS.fullmatch(given):
+            what = f"{name} has {len(given)} digits, over the bound of {_MAX_DIGITS}"
+            raise malformed(what, f"Send {name}: and the number of bytes that it is; no file is that large.")
+        raise malformed(f"{name} is {given[:40]!r}, which is no number of bytes", remedy)
     return int(given)
 
 

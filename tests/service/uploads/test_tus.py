@@ -7,7 +7,14 @@ import hashlib
 
 import pytest
 
-from service.api.http.tus import http_date, parse_announced, parse_checksum, parse_metadata, parse_number
+from service.api.http.tus import (
+    http_date,
+    parse_announced,
+    parse_checksum,
+    parse_metadata,
+    parse_number,
+    require_version,
+)
 from service.errors import ServiceError
 
 
@@ -67,6 +74,25 @@ def test_checksums() -> None:
         with pytest.raises(ServiceError) as caught:
             parse_checksum(given)
         assert caught.value.status == 400
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (None, "the header Upload-Length is missing"),
+        ("9" * 20, "Upload-Length has 20 digits, over the bound of 18"),
+        ("-1", "Upload-Length is '-1', which is no number of bytes"),
+    ],
+)
+def test_what_is_no_number_says_why(given: str | None, words: str) -> None:
+    with pytest.raises(ServiceError) as caught:
+        parse_number("Upload-Length", given)
+    assert (caught.value.status, caught.value.problem.detail) == (400, words)
+
+
+def test_a_missing_version_is_said_to_be_missing() -> None:
+    with pytest.raises(ServiceError, match="the header Tus-Resumable is missing"):
+        require_version(None)
 
 
 def test_numbers_and_dates() -> None:
