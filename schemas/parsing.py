@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
 import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -175,8 +177,9 @@ def parse_json(raw: bytes, *, max_bytes: int = MAX_MANIFEST_BYTES) -> Any:
         raise DocumentError([FieldProblem("", f"is not valid JSON: {error.msg} at {where}")]) from None
     except RecursionError:
         raise DocumentError([FieldProblem("", "is not valid: nested too deeply")]) from None
-    except ValueError as error:
-        raise DocumentError([FieldProblem("", f"is not valid JSON: {error}")]) from None
+    except ValueError:  # all that is left of what Python's parser raises
+        what = f"holds an integer of over {sys.get_int_max_str_digits()} digits"
+        raise DocumentError([FieldProblem("", what)]) from None
 
 
 def _require_bounded(raw: bytes, max_bytes: int) -> None:
@@ -222,9 +225,9 @@ def _problem(detail: dict[str, Any]) -> FieldProblem:
     elif kind == "finite_number":
         what = "must be a finite number"
     elif path.endswith("latitude_deg") and kind in ("less_than_equal", "greater_than_equal"):
-        what = f"{detail['input']} is not a latitude (-90 to 90): are latitude and longitude swapped?"
+        what = f"{_shown(detail['input'])} is not a latitude (-90 to 90): are latitude and longitude swapped?"
     elif path.endswith("timestamp_us") and kind in ("int_type", "int_from_float"):
-        what = f"{detail['input']!r} must be an integer number of microseconds"
+        what = f"{_shown(detail['input'])} must be an integer number of microseconds"
     elif path.endswith("timestamp_us") and kind == "less_than_equal":
         what = f"{detail['input']} is after the year 9999: give microseconds (are these nanoseconds?)"
     elif kind == "greater_than_equal" and str(detail["loc"][-1]).startswith("sigma_"):
@@ -232,5 +235,14 @@ def _problem(detail: dict[str, Any]) -> FieldProblem:
     elif kind == "string_pattern_mismatch" and not str(detail["input"]).isprintable():
         what = f"{detail['input'][:MAX_KEY_SHOWN]!r} holds control characters: give a name that can be printed"
     elif not what.startswith(("must", "coordinates")) and isinstance(detail["input"], str | int | float | None):
-        what = f"{what} (is {str(detail['input'])[:80]!r})"
+        what = f"{what} (is {_shown(detail['input'])})"
     return FieldProblem(path, what)
+
+
+def _shown(value: str | float | bool | None) -> str:
+    """A value as JSON has it: who sends it need not know Python."""
+    if isinstance(value, str):
+        return repr(value[:MAX_KEY_SHOWN])
+    if isinstance(value, float) and math.isinf(value):
+        return "a number beyond 1.8e308"
+    return json.dumps(value)[:MAX_KEY_SHOWN]

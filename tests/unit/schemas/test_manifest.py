@@ -178,7 +178,7 @@ def test_many_problems_are_counted(example: dict[str, Any]) -> None:
         (b"", "not valid JSON"),
         (b"[" * 100_000, "nested too deeply"),
         (b'{"ids": {"\xff": "road"}}', "not UTF-8"),
-        (b'{"ids": ' + b"1" * 5000 + b"}", "not valid JSON"),
+        (b'{"ids": ' + b"1" * 5000 + b"}", "integer of over 4300 digits"),
         (b"[]", "object"),
         (b" " * 101, "bound of 100"),
     ],
@@ -375,3 +375,22 @@ def test_a_file_is_no_folder_of_another(depth: int) -> None:
     folder = "/".join(["a"] * depth)
     assert [path for path, _ in name_problems([folder.upper(), f"{folder}/b/c.png"])] == [f"{folder}/b/c.png"]
     assert [path for path, _ in name_problems([f"drive.json/{folder}/c.png"])] == [f"drive.json/{folder}/c.png"]
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("null", "(is null)"),
+        ("true", "(is true)"),
+        ("1.5", "(is 1.5)"),
+        ('"1"', "(is '1')"),
+        ("1e400", "(is a number beyond 1.8e308)"),
+        ("1" * 5001, "holds an integer of over 4300 digits"),
+    ],
+)
+def test_values_are_shown_as_json_has_them(example: dict[str, Any], value: str, words: str) -> None:
+    example["rig"]["cameras"][0]["width"] = "HERE"
+    with pytest.raises(DocumentError) as caught:
+        parse_manifest(encoded(example).replace(b'"HERE"', value.encode()))
+    assert words in str(caught.value)
+    assert "sys." not in str(caught.value)
