@@ -383,6 +383,10 @@ class FilesMissing(ServiceError, status=422):
     """The result lacks files that exports read."""
 
 
+class BadCrs(ServiceError, status=422):
+    """No such projected coordinate reference system."""
+
+
 class CrsNotTaken(ServiceError, status=422):
     """No format takes a coordinate reference system."""
 

@@ -7,26 +7,24 @@ network.
 
 from __future__ import annotations
 
-import re
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
 from pyproj import CRS, Transformer
 from pyproj.aoi import AreaOfInterest
-from pyproj.exceptions import CRSError, ProjError
+from pyproj.exceptions import ProjError
 from pyproj.transformer import TransformerGroup
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import geodesy, utm
 from mrasfm_engine.types import Floats
+from schemas.earth_systems import REMEDY, EarthSystemError, parse_system
 from schemas.findings import listed
 
 _SOURCE = "EPSG:4979"
-_NAMED = re.compile(r"EPSG:([0-9]{4,6})(?:\+([0-9]{4,6}))?")
 _NEAR_DEG = 6.0  # of a system's area
 _SCENE_DEG = 0.05  # that a scene's area reaches from its origin: some kilometres
-_REMEDY = "Give a projected system, as EPSG:25832, if need be with a vertical datum, as EPSG:25832+7837."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,24 +106,18 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
         Where there is none of this name, it is not a projected one, the scene is far from its area, or its grid is not
         installed.
     """
-    match = _NAMED.fullmatch(name)
-    if match is None:
-        raise InputError(f"{name!r} names no coordinate reference system", remedy=_REMEDY, code="bad-crs")
-    horizontal = _known(name, match[1])
-    vertical = None if match[2] is None else _known(name, match[2])
-    if not horizontal.is_projected or horizontal.is_compound or len(horizontal.axis_info) != 2:
-        raise InputError(
-            f"EPSG:{match[1]} ({horizontal.name}) is no projected system of two axes", remedy=_REMEDY, code="bad-crs"
-        )
-    if vertical is not None and (not vertical.is_vertical or vertical.is_compound):
-        raise InputError(f"EPSG:{match[2]} ({vertical.name}) is no vertical datum", remedy=_REMEDY, code="bad-crs")
+    try:
+        named = parse_system(name)
+    except EarthSystemError as error:
+        raise InputError(str(error), remedy=REMEDY, code="bad-crs") from None
+    horizontal, vertical = named.horizontal, named.vertical
     _require_near(name, horizontal, at)
     target = horizontal.to_3d() if vertical is None else CRS.from_user_input(name)
     text = utm.with_ellipsoidal_heights(horizontal) if vertical is None else target.to_wkt("WKT1_GDAL")
     return EarthSystem(
         name=name,
         well_known_text=text,
-        horizontal=int(match[1]),
+        horizontal=named.code,
         has_vertical=vertical is not None,
         transformer=best_transformer(CRS.from_user_input(_SOURCE), target, at=at, name=name),
     )
@@ -153,13 +145,6 @@ def is_near(system: CRS, at: tuple[float, float]) -> bool:
     east_of_west = (at[1] - area.west + _NEAR_DEG) % 360.0
     width = (area.east - area.west) % 360.0 or 360.0
     return south <= at[0] <= north and east_of_west <= width + 2.0 * _NEAR_DEG
-
-
-def _known(name: str, code: str) -> CRS:
-    try:
-        return CRS.from_epsg(int(code))
-    except CRSError:
-        raise InputError(f"EPSG:{code} of {name!r} is not known", remedy=_REMEDY, code="bad-crs") from None
 
 
 def area_around(latitude_deg: float, longitude_deg: float) -> AreaOfInterest:
@@ -204,6 +189,6 @@ def best_transformer(source: CRS, target: CRS, *, at: tuple[float, float], name:
         )
     if not group.transformers:
         raise InputError(
-            f"no transformation from WGS84 to {name} is known where the scene lies", remedy=_REMEDY, code="bad-crs"
+            f"no transformation from WGS84 to {name} is known where the scene lies", remedy=REMEDY, code="bad-crs"
         )
     return group.transformers[0]

@@ -17,7 +17,7 @@ from schemas.artifacts import ROAD_TIFF_FILE, component_folder
 from schemas.exports import EXPORT_FORMATS, EXPORTED_OF_MAP, EXPORTED_OF_SCENE, is_read_by_export
 from service.database.tables import Blob, Drive, Export, MapFile, MapScene, MapVersion, Scene, SceneFile
 from service.domain.map_inputs import StoredArtifact
-from service.errors import ComponentUnknown, CrsNotTaken, DriveDeleted, FilesMissing, NotGeoreferenced
+from service.errors import BadCrs, ComponentUnknown, CrsNotTaken, DriveDeleted, FilesMissing, NotGeoreferenced
 
 _COMPONENT = "component"  # among the options of an export; the engine does not know it
 
@@ -158,12 +158,21 @@ class ExportInputs:
         return found
 
     def _require_crs(self) -> None:
+        crs = self.options["crs"]
+        if crs is None:
+            return
         taking = [known.name for known in EXPORT_FORMATS.values() if known.takes_crs]
-        if self.options["crs"] is not None and not set(taking) & set(self.formats):
+        if not set(taking) & set(self.formats):
             raise CrsNotTaken(
                 f"crs is given, and no format of {', '.join(self.formats)} takes one",
                 remedy=f"Leave it out; formats that take one: {', '.join(taking) or 'none'}.",
             )
+        from schemas.earth_systems import REMEDY, EarthSystemError, parse_system  # its library, of few requests
+
+        try:
+            parse_system(crs)
+        except EarthSystemError as error:
+            raise BadCrs(str(error), remedy=REMEDY) from None
 
     def _require_files(self, session: Session) -> None:
         read = EXPORTED_OF_SCENE if isinstance(self.subject, Scene) else EXPORTED_OF_MAP

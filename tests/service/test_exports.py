@@ -148,6 +148,22 @@ def test_what_is_refused(client: Client, scene_id: str) -> None:
     problem_of(client.get(f"/v1/exports/{asked['id']}/files/none"), 404, "not-found")
 
 
+def test_a_system_that_is_none_is_refused_before_a_job(client: Client, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_api, "SUMMARY", live_api.SUMMARY.model_copy(update={"georeferenced": True}))
+    scene_id = client.scene({**SCENE_FILES, "points.ply": b"somewhere"})
+    url = f"/v1/scenes/{scene_id}/exports"
+    for crs, words in (
+        ("EPSG:999999", "EPSG:999999 of 'EPSG:999999' is not known"),
+        ("EPSG:4326", "EPSG:4326 (WGS 84) is no projected system"),
+        ("EPSG:25832+25833", "is no vertical datum"),
+    ):
+        refused = problem_of(client.post(url, json={"formats": ["copc"], "crs": crs}), 422, "bad-crs")
+        assert words in refused["detail"]
+        assert "EPSG:25832+7837" in refused["remedy"]
+    assert client.get("/v1/exports").json()["items"] == []
+    ask(client, scene_id, formats=["copc"], crs="EPSG:25832+7837")
+
+
 def test_a_scene_nowhere_on_earth(client: Client, scene_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(live_api, "SUMMARY", live_api.SUMMARY.model_copy(update={"georeferenced": False}))
     nowhere = client.scene({**SCENE_FILES, "points.ply": b"nowhere"})
