@@ -144,6 +144,7 @@ def _conversed(
 ) -> int:
     from service.client import ApiError, Client, ClientError, UnreachableError
     from service.client.download import require_free
+    from service.errors import Unauthorized
 
     try:
         if arguments.out is not None:
@@ -155,7 +156,11 @@ def _conversed(
         return _failed(summary, display, str(error), EXIT_UNREACHABLE)
     except ApiError as error:
         summary.problem = error.problem.model_dump(mode="json", exclude_defaults=True)
-        lines = "\n".join([str(error), *_items_of(error.problem)])
+        if error.code == Unauthorized.code:
+            told = f"{error.problem.detail.rstrip('.')}. {_remedy_of_key(arguments.key_file)}"
+        else:
+            told = str(error)
+        lines = "\n".join([told, *_items_of(error.problem)])
         return _failed(summary, display, lines, EXIT_UNREACHABLE if _is_trouble(error.status) else EXIT_REFUSED)
     except BrokenPipeError:  # of what is printed: the program's
         raise
@@ -217,6 +222,15 @@ def _key(key_file: Path | None) -> str:
         return key_file.read_text("ascii")
     except (OSError, UnicodeDecodeError) as error:
         raise ClientError(f"the key file {key_file} cannot be read: {error}. Give a file that holds the key.") from None
+
+
+def _remedy_of_key(key_file: Path | None) -> str:
+    """Advice on a key that the service does not take: its own is for who writes requests."""
+    if key_file is None:
+        where = f"The key is that of {KEY_VARIABLE}: correct it, or give --key-file."
+    else:
+        where = f"The key is that of --key-file {key_file}: correct it, or set {KEY_VARIABLE} and leave --key-file out."
+    return f"{where} The operator of the service makes keys with 'mrasfm keys create'."
 
 
 def _warn_of_plain_http(url: str, display: Display) -> None:

@@ -238,8 +238,19 @@ def test_a_wrong_key_says_what_to_do(client: Client, drive: Path, tmp_path: Path
     assert code == 2
     assert "API key is not valid" in told
     assert "mrasfm keys create" in told
+    assert f"--key-file {tmp_path / 'key'}" in told
+    assert "MRASFM_API_KEY" in told
+    assert "Authorization" not in told, "who gives a command writes no headers"
     assert "mrasfm_wrong" not in told
     assert summary["problem"]["type"] == PROBLEM_TYPE + "unauthorized"
+
+
+def test_a_wrong_key_of_the_environment_is_said_to_be_that(client: Client, drive: Path) -> None:
+    code, _, told = Upload(drive, url=client.api.url, key="mrasfm_wrong").ended()
+    assert code == 2
+    assert "The key is that of MRASFM_API_KEY" in told
+    assert "--key-file" in told
+    assert "mrasfm_wrong" not in told
 
 
 def test_without_a_key_it_says_where_to_put_one(drive: Path) -> None:
