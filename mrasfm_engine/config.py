@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mrasfm_engine.errors import InputError
 from schemas.drive import MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
+from schemas.findings import enumerated
 from schemas.methods import ExtractorName, MatcherName
 from schemas.parsing import MAX_PROBLEMS_SHOWN
 
@@ -351,10 +352,8 @@ class EngineConfig(_Section):
 
 def described(error: ValidationError) -> str:
     """Describe settings that are unknown or out of range: all, up to a number that a screen has room for."""
-    problems = error.errors(include_url=False)
-    shown = [f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in problems[:MAX_PROBLEMS_SHOWN]]
-    more = len(problems) - len(shown)
-    return "; ".join([*shown, *([f"and {more} more"] if more else [])])
+    told = [f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors(include_url=False)]
+    return enumerated(told, MAX_PROBLEMS_SHOWN)
 
 
 def read_config(path: Path | None, **overrides: Any) -> EngineConfig:

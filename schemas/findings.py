@@ -61,3 +61,15 @@ def listed(names: Sequence[object], shown: int = 3) -> str:
     """Names joined by commas; of many, the first few and how many more there are."""
     head = ", ".join(str(name) for name in names[:shown])
     return head if len(names) <= shown else f"{head} and {len(names) - shown} more"
+
+
+def enumerated(sentences: Sequence[str], shown: int, *, count: int | None = None) -> str:
+    """Sentences joined by semicolons; of many, the first few and how many more there are.
+
+    Parameters
+    ----------
+    count
+        Of all, where not all are given.
+    """
+    more = (count or len(sentences)) - len(sentences[:shown])
+    return "; ".join([*sentences[:shown], *([f"and {more} more"] if more else [])])

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 
 from schemas.drive import MIN_SIGMA, DriveManifest
 from schemas.file_names import name_problems
+from schemas.findings import enumerated
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
 # 100,000 frames of 8 cameras and a million GNSS samples have 9 million values, in 3 million objects and lists.
@@ -52,11 +53,8 @@ class DocumentError(ValueError):
 
     def __init__(self, problems: list[FieldProblem], *, count: int | None = None) -> None:
         self.problems = problems
-        shown = [f"{p.path}: {p.what}" if p.path else p.what for p in problems[:MAX_PROBLEMS_SHOWN]]
-        more = (count or len(problems)) - len(shown)
-        if more:
-            shown.append(f"and {more} more")
-        super().__init__("; ".join(shown))
+        told = [f"{p.path}: {p.what}" if p.path else p.what for p in problems]
+        super().__init__(enumerated(told, MAX_PROBLEMS_SHOWN, count=count))
 
 
 def parse_manifest(raw: bytes) -> DriveManifest:

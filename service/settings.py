@@ -220,9 +220,8 @@ class Settings(BaseSettings):
         """The database's URL, with the embedded one in its place where none is set."""
         if self.database_url is not None:
             return self.database_url.get_secret_value()
-        return URL.create(
-            "sqlite", database=str(self.database_file)
-        ).render_as_string()  # quoted: a folder may be named `a?b`
+        path = str(self.database_file)
+        return URL.create("sqlite", database=path).render_as_string()  # quoted: a folder may be named `a?b`
 
     @property
     def tile_origin(self) -> str | None:

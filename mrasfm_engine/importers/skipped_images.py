@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mrasfm_engine.importers.recording import SourceUnit
-from schemas.findings import listed
+from schemas.findings import enumerated, listed
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 # Files that recordings and file managers keep beside the images.
@@ -38,7 +38,11 @@ def notes_of_unread_files(unread: Mapping[str, Sequence[str]]) -> list[str]:
     """
     shown = {folder: listed([*map(_short, names)], MAX_NAMES) for folder, names in unread.items() if names}
     parts = [f"{_short(folder)}: {len(unread[folder])} ({names})" for folder, names in shown.items()]
-    return [f"Files that are not read, as images are .png, .jpg or .jpeg: {_joined(parts)}."] if parts else []
+    return (
+        [f"Files that are not read, as images are .png, .jpg or .jpeg: {enumerated(parts, MAX_FOLDERS)}."]
+        if parts
+        else []
+    )
 
 
 def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit]) -> list[str]:
@@ -48,12 +52,7 @@ def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit])
         frames = [unit.source_frame for unit in units if camera not in unit.images]
         if frames:
             parts.append(f"{_short(camera)} in {len(frames)} of {len(units)} ({listed(frames, MAX_NAMES)})")
-    return [f"Frames without an image of a camera: {_joined(parts)}."] if parts else []
-
-
-def _joined(parts: Sequence[str]) -> str:
-    head = "; ".join(parts[:MAX_FOLDERS])
-    return head if len(parts) <= MAX_FOLDERS else f"{head}; and {len(parts) - MAX_FOLDERS} more"
+    return [f"Frames without an image of a camera: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
 
 
 def _short(name: str) -> str:

@@ -15,6 +15,7 @@ from service.database.tables import Checkpoint, Drive, DriveFile, Export, Export
 # Ids of blobs; None where they are more than are kept in memory for it.
 Named = frozenset[str] | None
 MAX_NAMED = 20_000
+_EXPORTED = select(ExportFile.blob_id).join(Export, Export.id == ExportFile.export_id)
 
 
 def of_drive(session: Session, drive_id: str) -> Named:
@@ -29,32 +30,29 @@ def of_drive(session: Session, drive_id: str) -> Named:
 
 def of_scene(session: Session, scene_id: str) -> Named:
     """Blobs that a scene and its exports name."""
-    exported = select(ExportFile.blob_id).join(Export, Export.id == ExportFile.export_id)
     return _named(
         session,
         select(SceneFile.blob_id).where(SceneFile.scene_id == scene_id),
-        exported.where(Export.scene_id == scene_id),
+        _EXPORTED.where(Export.scene_id == scene_id),
     )
 
 
 def of_map(session: Session, map_id: str) -> Named:
     """Blobs that the versions of a map, their exports and its finished stages name."""
-    exported = select(ExportFile.blob_id).join(Export, Export.id == ExportFile.export_id)
     return _named(
         session,
         select(MapCheckpoint.blob_id).where(MapCheckpoint.map_id == map_id),
         select(MapFile.blob_id).where(MapFile.map_id == map_id),
-        exported.where(Export.map_id == map_id),
+        _EXPORTED.where(Export.map_id == map_id),
     )
 
 
 def of_version(session: Session, map_id: str, number: int) -> Named:
     """Blobs that a version of a map and its exports name."""
-    exported = select(ExportFile.blob_id).join(Export, Export.id == ExportFile.export_id)
     return _named(
         session,
         select(MapFile.blob_id).where(MapFile.map_id == map_id, MapFile.number == number),
-        exported.where(Export.map_id == map_id, Export.map_version == number),
+        _EXPORTED.where(Export.map_id == map_id, Export.map_version == number),
     )
 
 

@@ -6,12 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import delete, event, update
+from sqlalchemy import delete, update
 
 from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.tables import Drive, Job, JobMember, Scene
 from service.domain import job_trees, jobs
+from tests.helpers.executed_statements import statements_of
 from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, problem_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
 
@@ -361,17 +362,8 @@ def test_the_quota_of_jobs_counts_the_whole_tree(api: Api) -> None:
 
 
 def test_active_jobs_are_counted_once_for_the_whole_tree(api: Api, client: Client, drives: list[str]) -> None:
-    statements: list[str] = []
-
-    def executed(connection: Any, cursor: Any, statement: str, *given: Any) -> None:
-        statements.append(statement)
-
-    engine = api.context.database.engine
-    event.listen(engine, "after_cursor_execute", executed)
-    try:
+    with statements_of(api.context.database) as statements:
         client.aggregate(drives=drives)
-    finally:
-        event.remove(engine, "after_cursor_execute", executed)
     counts = [each for each in statements if "count(*)" in each and "jobs.project_id" in each]
     assert len(counts) == 1
 

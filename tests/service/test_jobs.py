@@ -7,12 +7,10 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from typing import Any
 
 import httpx
 import pytest
-from sqlalchemy import event as engine_event
 from sqlalchemy import insert
 
 from schemas.api.jobs import JobKind
@@ -21,6 +19,7 @@ from service.api.routes import job_views
 from service.database.tables import ApiKey, Job, JobMember, Project, new_id, now_us
 from service.domain import jobs
 from service.domain.keys import revoke_key
+from tests.helpers.executed_statements import statements_of
 from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
 from tests.helpers.sqlite_steps import sqlite_steps
 from tests.helpers.tiny_drive import tiny_drive
@@ -149,26 +148,13 @@ def test_a_job_stalls_by_the_database_s_clock(postgres_api: Api, set_clock: Call
 
     before = count_stalled()
     set_clock(off_us)
-    with statements_of(postgres_api) as statements:
+    with statements_of(postgres_api.context.database) as statements:
         states = {job["id"]: job["state"] for job in client.get("/v1/jobs").json()["items"]}
     assert (states[silent], states[alive]) == ("STALLED", "RUNNING")
     assert sum("clock_timestamp" in statement for statement in statements) == 1, "one look at the clock for all jobs"
     counted = count_stalled()
     set_clock(0)
     assert before <= counted <= count_stalled(), "jobs of others may stall meanwhile"
-
-
-@contextmanager
-def statements_of(api: Api) -> Iterator[list[str]]:
-    """What the API asks its database."""
-    engine, statements = api.context.database.engine, list[str]()
-
-    def executed(connection: Any, cursor: Any, statement: str, *_: object) -> None:
-        statements.append(statement)
-
-    engine_event.listen(engine, "after_cursor_execute", executed)
-    yield statements
-    engine_event.remove(engine, "after_cursor_execute", executed)
 
 
 def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
@@ -224,17 +210,8 @@ def test_a_page_of_jobs_ends_where_their_members_are_many(api: Api, monkeypatch:
 def test_a_page_of_jobs_reads_no_more_than_it_shows(api: Api) -> None:
     client = api.client()
     _history(client, *[0] * 20, *[1500] * 3)
-    statements: list[str] = []
-
-    def executed(connection: Any, cursor: Any, statement: str, *given: Any) -> None:
-        statements.append(statement)
-
-    engine = api.context.database.engine
-    engine_event.listen(engine, "after_cursor_execute", executed)
-    try:
+    with statements_of(api.context.database) as statements:
         page = client.get("/v1/jobs", params={"limit": 1000}).json()
-    finally:
-        engine_event.remove(engine, "after_cursor_execute", executed)
     assert [len(shown["members"]) for shown in page["items"]] == [*[0] * 20, 1500]
     assert len(statements) < 12, "however many jobs and members there are"
     of_members = [statement for statement in statements if "job_members.name" in statement]
