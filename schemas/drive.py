@@ -25,6 +25,8 @@ from pydantic import (
 )
 from pydantic.config import JsonDict
 
+from schemas.patterns import Pattern
+
 # Long lists end at their first bad item (FailFast): a million bad ones would take gigabytes to describe.
 
 # Models of the cameras that cars carry, with their parameters in order: COLMAP's, and the unified model of Mei and
@@ -66,13 +68,23 @@ LAST_TIMESTAMP_US = 253_402_300_799_999_999  # the last of the year 9999, since 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Sigma = Annotated[float, Field(ge=MIN_SIGMA, allow_inf_nan=False, le=1e6)]
 TimestampUs = Annotated[int, Field(ge=0, le=LAST_TIMESTAMP_US, strict=True)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
+Name = Annotated[
+    str,
+    Pattern(
+        r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$",
+        words="1 to 64 letters (A-Z, a-z), digits and _ . - without spaces, first a letter or digit",
+    ),
+]
 MAX_VEHICLE_CHARACTERS = 64
-VEHICLE_PATTERN = rf"^[A-Za-z0-9][A-Za-z0-9_.:-]{{0,{MAX_VEHICLE_CHARACTERS - 1}}}$"
-Vehicle = Annotated[str, Field(pattern=VEHICLE_PATTERN)]
+VEHICLE_NAME = Pattern(
+    rf"^[A-Za-z0-9][A-Za-z0-9_.:-]{{0,{MAX_VEHICLE_CHARACTERS - 1}}}$",
+    words=f"1 to {MAX_VEHICLE_CHARACTERS} letters (A-Z, a-z), digits and _ . : - without spaces, "
+    "first a letter or digit",
+)
+Vehicle = Annotated[str, VEHICLE_NAME]
 # Names that people read have no control characters: terminals would obey them.
-PRINTED_NAME_PATTERN = r"^[^\x00-\x1f\x7f-\x9f]+$"
-DriveName = Annotated[str, Field(min_length=1, max_length=200, pattern=PRINTED_NAME_PATTERN)]
+PRINTED_NAME = Pattern(r"^[^\x00-\x1f\x7f-\x9f]+$", words="characters that can be printed, without control characters")
+DriveName = Annotated[str, Field(min_length=1, max_length=200), PRINTED_NAME]
 
 
 def _relative_path(value: str) -> str:
@@ -282,8 +294,10 @@ class GnssSample(_Model):
 class Gnss(_Model):
     """The receiver's positions."""
 
-    height_datum: str = Field(
-        pattern=r"^(ellipsoidal|EPSG:[0-9]{4,6})$",
+    height_datum: Annotated[
+        str,
+        Pattern(r"^(ellipsoidal|EPSG:[0-9]{4,6})$", words="'ellipsoidal' or EPSG: with 4 to 6 digits"),
+    ] = Field(
         description="what height_m counts from: 'ellipsoidal' (WGS84), or the EPSG code of a vertical datum",
     )
     antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.drive import MIN_SIGMA, DriveManifest
 from schemas.file_names import name_problems
 from schemas.findings import enumerated
+from schemas.patterns import MISMATCH
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
 # 100,000 frames of 8 cameras and a million GNSS samples have 9 million values, in 3 million objects and lists.
@@ -230,7 +231,7 @@ def _problem(detail: dict[str, Any]) -> FieldProblem:
         what = f"{detail['input']} is after the year 9999: give microseconds (are these nanoseconds?)"
     elif kind == "greater_than_equal" and str(detail["loc"][-1]).startswith("sigma_"):
         what = f"{detail['input']} is no standard deviation: give {MIN_SIGMA:g} or more (nothing is known better)"
-    elif kind == "string_pattern_mismatch" and not str(detail["input"]).isprintable():
+    elif kind == MISMATCH and not str(detail["input"]).isprintable():
         what = f"{detail['input'][:MAX_KEY_SHOWN]!r} holds control characters: give a name that can be printed"
     elif not what.startswith(("must", "coordinates")) and isinstance(detail["input"], str | int | float | None):
         what = f"{what} (is {_shown(detail['input'])})"

@@ -30,7 +30,7 @@ from mrasfm_engine.importers.skipped_images import notes_of_missing_images, note
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
-from schemas.drive import MAX_RIG_EXTENT_M, MAX_VEHICLE_CHARACTERS, VEHICLE_PATTERN
+from schemas.drive import MAX_RIG_EXTENT_M, VEHICLE_NAME
 from schemas.findings import listed
 
 LAYOUTS: tuple[ModuleType, ...] = (
@@ -122,11 +122,10 @@ def import_recording(
 
 
 def _require_vehicle_name(vehicle: str | None) -> None:
-    if vehicle is not None and not re.fullmatch(VEHICLE_PATTERN, vehicle):
+    if vehicle is not None and not re.fullmatch(VEHICLE_NAME.expression, vehicle):
         raise InputError(
             f"--vehicle {vehicle!r} is no name of a vehicle",
-            remedy=f"Give 1 to {MAX_VEHICLE_CHARACTERS} letters, digits and _ . : - without spaces, the first a letter "
-            "or a digit.",
+            remedy=f"Give {VEHICLE_NAME.words}.",
             code="bad-vehicle",
         )
 

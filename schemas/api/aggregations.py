@@ -6,14 +6,12 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field, StringConstraints
 
-from schemas.api.jobs import DriveId, ReconstructionSettings
-from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_MAP, EXAMPLE_OTHER_DRIVE, EXAMPLE_SCENE, RequestBody
-from schemas.drive import PRINTED_NAME_PATTERN
+from schemas.api.jobs import ReconstructionSettings
+from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_MAP, EXAMPLE_OTHER_DRIVE, EXAMPLE_SCENE, Id, RequestBody
+from schemas.drive import PRINTED_NAME
 
 MAX_MEMBERS = 1000
-SceneId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
-MapId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
-MapName = Annotated[str, StringConstraints(min_length=1, max_length=200, pattern=PRINTED_NAME_PATTERN)]
+MapName = Annotated[str, StringConstraints(min_length=1, max_length=200), PRINTED_NAME]
 
 
 class AggregationRequest(RequestBody):
@@ -37,17 +35,15 @@ class AggregationRequest(RequestBody):
         }
     )
 
-    drives: Annotated[list[DriveId], Field(max_length=MAX_MEMBERS)] = Field(
+    drives: Annotated[list[Id], Field(max_length=MAX_MEMBERS)] = Field(
         default=[],
         description="committed drives; what is not reconstructed yet with these settings is reconstructed first",
     )
-    scenes: Annotated[list[SceneId], Field(max_length=MAX_MEMBERS)] = Field(
+    scenes: Annotated[list[Id], Field(max_length=MAX_MEMBERS)] = Field(
         default=[], description="scenes that are taken as they are"
     )
-    map_id: MapId | None = Field(
-        None, description="make a new version of this map from its current one; null: a new map"
-    )
-    remove: Annotated[list[DriveId], Field(max_length=MAX_MEMBERS)] = Field(
+    map_id: Id | None = Field(None, description="make a new version of this map from its current one; null: a new map")
+    remove: Annotated[list[Id], Field(max_length=MAX_MEMBERS)] = Field(
         default=[], description="drives or scenes of the map's current version that the new one shall not have"
     )
     name: MapName | None = Field(None, description="of a new map; by default after its drives")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, ConfigDict, Field, StringConstraints, WithJsonSchema
+from pydantic import AfterValidator, ConfigDict, Field, WithJsonSchema
 from pydantic.config import JsonDict
 from pydantic_core import PydanticCustomError
 
@@ -21,6 +21,7 @@ from schemas.api.resource import (
     Times,
 )
 from schemas.exports import EXPORT_FORMATS, MAX_COMPONENT, MAX_FORMATS, MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
+from schemas.patterns import Pattern
 
 
 def _known(name: str) -> str:
@@ -31,7 +32,13 @@ def _known(name: str) -> str:
 
 
 FormatName = Annotated[str, AfterValidator(_known), WithJsonSchema({"type": "string", "enum": list(EXPORT_FORMATS)})]
-Crs = Annotated[str, StringConstraints(pattern=r"^EPSG:[0-9]{4,6}(\+[0-9]{4,6})?$")]
+Crs = Annotated[
+    str,
+    Pattern(
+        r"^EPSG:[0-9]{4,6}(\+[0-9]{4,6})?$",
+        words="EPSG: and 4 to 6 digits, as EPSG:25832, or with + and those of a height, as EPSG:25832+7837",
+    ),
+]
 
 
 class ExportRequest(RequestBody):

@@ -6,14 +6,21 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated, Any
 
-from pydantic import ConfigDict, Field, StringConstraints
+from pydantic import ConfigDict, Field
 from pydantic.config import JsonDict
 
 from schemas.api.problems import Problem
-from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_JOB, RequestBody, Resource, Times
+from schemas.api.resource import EXAMPLE_DRIVE, EXAMPLE_JOB, Id, RequestBody, Resource, Times
 from schemas.methods import ExtractorName, MatcherName
+from schemas.patterns import Pattern
 
-DriveId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,40}$")]
+ModelName = Annotated[
+    str,
+    Pattern(
+        "^[a-z0-9][a-z0-9._-]{0,63}$",
+        words="1 to 64 lower-case letters (a-z), digits and _ . - without spaces, first a letter or digit",
+    ),
+]
 
 
 class ReconstructionSettings(RequestBody):
@@ -36,7 +43,7 @@ class ReconstructionSettings(RequestBody):
     matcher: MatcherName | None = Field(
         None, description="all but nearest need a model on the workers, trained on the extractor's descriptors"
     )
-    segmentation_model: Annotated[str, Field(pattern="^[a-z0-9][a-z0-9._-]{0,63}$")] | None = Field(
+    segmentation_model: ModelName | None = Field(
         None, description="name of a model on the workers that makes masks for images that come without"
     )
     semantic_triangulation: bool | None = Field(None, description="drop points of the road that are off its surface")
@@ -53,7 +60,7 @@ class ReconstructionRequest(RequestBody):
         json_schema_extra={"examples": [{"drive_id": EXAMPLE_DRIVE, "settings": {"use_gnss": True}}]}
     )
 
-    drive_id: DriveId = Field(description="a committed drive")
+    drive_id: Id = Field(description="a committed drive")
     settings: ReconstructionSettings = ReconstructionSettings()
 
 

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from datetime import datetime
 from typing import Annotated, Any, Generic, Literal, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field
 from pydantic.config import JsonDict
 
 from schemas.notebook_table import notebook_table
+from schemas.patterns import Pattern
 
 # Examples tell of the same things throughout: an answer shows what the request before it made.
 EXAMPLE_DRIVE = "drv_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
@@ -20,7 +21,8 @@ EXAMPLE_MAP = "map_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
 EXAMPLE_EXPORT = "exp_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
 EXAMPLE_SHA256 = "ab" * 32
 
-Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Id = Annotated[str, Pattern(r"^[a-z0-9_]{1,40}$", words="an id: 1 to 40 lower-case letters (a-z), digits and _")]
+Sha256 = Annotated[str, Pattern(r"^[0-9a-f]{64}$", words="64 hexadecimal digits in lower case")]
 Item = TypeVar("Item")
 
 

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, StringConstraints
 from pydantic.config import JsonDict
 
 from schemas.api.resource import EXAMPLE_JOB, RequestBody, Resource
+from schemas.patterns import Pattern
 
 MAX_URL_CHARACTERS = 2000
 EXAMPLE_WEBHOOK = "whk_1f0c2a9d3b7e4f5a6c8d9e0f1a2b3c"
@@ -41,14 +42,20 @@ class WebhookRequest(RequestBody):
     )
 
     url: Annotated[
-        str, StringConstraints(min_length=8, max_length=MAX_URL_CHARACTERS, pattern=r"^https?://[\x21-\x7e]+$")
+        str,
+        StringConstraints(min_length=8, max_length=MAX_URL_CHARACTERS),
+        Pattern(
+            r"^https?://[\x21-\x7e]+$", words="a URL in ASCII that begins with https:// or http://, without spaces"
+        ),
     ] = Field(description="takes POST requests; https, and no address of a private network")
     events: Annotated[list[WebhookEvent], Field(min_length=1, max_length=len(WebhookEvent))] = Field(
         default=list(WebhookEvent), description="that it is told of; by default all"
     )
-    description: Annotated[str, StringConstraints(max_length=200, pattern=r"^[^\x00-\x1f\x7f-\x9f]*$")] = Field(
-        "", description="for people"
-    )
+    description: Annotated[
+        str,
+        StringConstraints(max_length=200),
+        Pattern(r"^[^\x00-\x1f\x7f-\x9f]*$", words="characters that can be printed, without control characters"),
+    ] = Field("", description="for people")
 
 
 _WEBHOOK: JsonDict = {

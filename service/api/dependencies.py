@@ -11,10 +11,11 @@ from typing import Annotated
 from fastapi import BackgroundTasks, Depends, Header, Query, Request, Response
 from fastapi.responses import JSONResponse
 from fastapi.security import HTTPBearer
-from pydantic import BaseModel
+from pydantic import BaseModel, StringConstraints
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
+from schemas.patterns import Pattern
 from service.api.context import Context
 from service.api.credentials import secret_of
 from service.api.http.event_streams import EventStream
@@ -104,6 +105,11 @@ Cursor = Annotated[str | None, Query(max_length=MAX_CURSOR_CHARACTERS, descripti
 _IDEMPOTENCY = (
     "Names this request: repeated under the same key it has its effect once, and the first answer is replayed for a day"
 )
+_Key = Annotated[
+    str,
+    StringConstraints(min_length=1, max_length=255),
+    Pattern(r"^[\x21-\x7e]+$", words="printable characters of ASCII without spaces"),
+]
 
 
 @dataclass(frozen=True)
@@ -144,12 +150,7 @@ async def get_idempotent_request(
     caller: CallerDep,
     request: Request,
     background: BackgroundTasks,
-    idempotency_key: Annotated[
-        str | None,
-        Header(
-            alias="Idempotency-Key", min_length=1, max_length=255, pattern=r"^[\x21-\x7e]+$", description=_IDEMPOTENCY
-        ),
-    ] = None,
+    idempotency_key: Annotated[_Key | None, Header(alias="Idempotency-Key", description=_IDEMPOTENCY)] = None,
 ) -> IdempotentRequest:
     """The idempotent execution of this request."""
     return IdempotentRequest(context, caller, request, background, idempotency_key)

@@ -71,6 +71,32 @@ def test_drives_of_one_vehicle(client: Client) -> None:
     assert "vehicle" in json.dumps(problem)
 
 
+@pytest.mark.parametrize("name", ["front left", "größe"])
+def test_a_camera_name_that_is_refused_is_told_in_words(client: Client, name: str) -> None:
+    document = manifest()
+    document["rig"]["cameras"][0]["name"] = name
+    problem = problem_of(client.post("/v1/drives", json=document), 422, "invalid-document")
+    named = next(error for error in problem["errors"] if error["field"] == "rig.cameras.0.name")
+    assert "letters (A-Z, a-z), digits and _ . - without spaces" in named["detail"]
+    assert name in named["detail"]
+    assert "[A-Z" not in json.dumps(problem)
+
+
+@pytest.mark.parametrize(
+    ("path", "parameter", "words"),
+    [
+        ("/v1/drives", "vehicle", "letters (A-Z, a-z), digits and _ . : -"),
+        ("/v1/jobs", "drive_id", "an id: 1 to 40 lower-case letters"),
+        ("/v1/scenes", "drive_id", "an id: 1 to 40 lower-case letters"),
+    ],
+)
+def test_a_parameter_that_is_refused_is_told_in_words(client: Client, path: str, parameter: str, words: str) -> None:
+    problem = problem_of(client.get(path, params={parameter: "not one"}), 422, "invalid-request")
+    assert problem["errors"][0]["field"] == f"query.{parameter}"
+    assert words in problem["errors"][0]["detail"]
+    assert "pattern" not in json.dumps(problem)
+
+
 @pytest.mark.parametrize("cursor", ["", "x", "bnVsbA", "WzEsIlx1ZDgwMCJd", "WzEsIlx1MDAwMCJd", "WzEuNSwiYSJd", "ÿ"])
 def test_a_cursor_of_another_making_is_refused(client: Client, cursor: str) -> None:
     problem_of(client.get("/v1/drives", params={"cursor": cursor}), 422, "bad-cursor")

@@ -12,7 +12,7 @@ from starlette.concurrency import run_in_threadpool
 
 from schemas.api.drives import DriveResource, DriveState, PreflightResource
 from schemas.api.resource import Finding, Page
-from schemas.drive import VEHICLE_PATTERN, DriveManifest
+from schemas.drive import DriveManifest, Vehicle
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us, moment
 from service.api.http.body_reading import parsed_body
@@ -88,7 +88,7 @@ def list_drives(
     context: ContextDep,
     limit: Limit = 50,
     cursor: Cursor = None,
-    vehicle: Annotated[str | None, Query(pattern=VEHICLE_PATTERN, description="only of this vehicle")] = None,
+    vehicle: Annotated[Vehicle | None, Query(description="only of this vehicle")] = None,
 ) -> Page[DriveResource]:
     """Drives of the project, newest first."""
     with context.database.read() as session:

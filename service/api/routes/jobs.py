@@ -12,7 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind, JobResource
-from schemas.api.resource import Page
+from schemas.api.resource import Id, Page
 from service.api.context import Context
 from service.api.credentials import secret_of
 from service.api.dependencies import (
@@ -64,7 +64,7 @@ def list_jobs(
     request: Request,
     limit: Limit = 50,
     cursor: Cursor = None,
-    drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
+    drive_id: Annotated[Id | None, Query(description="only of this drive")] = None,
 ) -> Response:
     """Jobs of the project, newest first. A page ends before `limit` where its jobs have thousands of members."""
     with context.database.read() as session:

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 from sqlalchemy import delete
 from sqlalchemy.orm import Session
 
-from schemas.api.resource import Page
+from schemas.api.resource import Id, Page
 from schemas.api.scenes import SceneFileResource, SceneResource
 from service.api.dependencies import CallerDep, ContextDep, Cursor, Limit, moment
 from service.api.http.paging import newest
@@ -30,7 +30,7 @@ def list_scenes(
     context: ContextDep,
     limit: Limit = 50,
     cursor: Cursor = None,
-    drive_id: Annotated[str | None, Query(pattern="^[a-z0-9_]{1,40}$", description="only of this drive")] = None,
+    drive_id: Annotated[Id | None, Query(description="only of this drive")] = None,
 ) -> Page[SceneResource]:
     """Scenes of the project, newest first, without their files."""
     with context.database.read() as session:

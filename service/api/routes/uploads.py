@@ -10,7 +10,7 @@ from fastapi import APIRouter, Header, Query, Request, Response
 from fastapi.routing import APIRoute
 from sqlalchemy.orm import Session
 
-from schemas.api.resource import Page
+from schemas.api.resource import Page, Sha256
 from schemas.api.uploads import UploadResource
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, moment
 from service.api.http import tus
@@ -77,9 +77,7 @@ def list_uploads(
     context: ContextDep,
     limit: Limit = 100,
     cursor: Cursor = None,
-    sha256: Annotated[
-        str | None, Query(pattern="^[0-9a-f]{64}$", description="only uploads announced with this digest")
-    ] = None,
+    sha256: Annotated[Sha256 | None, Query(description="only uploads announced with this digest")] = None,
 ) -> Page[UploadResource]:
     """Uploads of the drive that take bytes still. A client that has lost an upload's URL finds it by its digest.
 

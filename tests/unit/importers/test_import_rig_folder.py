@@ -101,6 +101,18 @@ def test_cameras_whose_folders_are_one_on_many_systems(recording: Path, tmp_path
     assert "camera" in error.remedy
 
 
+def test_a_camera_whose_name_no_manifest_has(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The message names the camera and says which names there may be, without a regular expression."""
+    edit_rig(recording, lambda document: document["cameras"].update({"vorne links": document["cameras"].pop("cam_r")}))
+    (recording / "cam_r").rename(recording / "vorne links")
+    assert main(["import", str(recording), "--out", str(tmp_path / "drive")]) == EXIT_BAD_INPUT
+    said = " ".join(capsys.readouterr().err.split())
+    assert "cameras.vorne links.[key]: Input should be 1 to 64 letters (A-Z, a-z), digits and _ . -" in said
+    assert "[A-Z" not in said
+
+
 def test_everything_arrives_in_our_axes(recording: Path, tmp_path: Path) -> None:
     summary = import_recording(recording, tmp_path / "drive")
     assert (summary.layout, summary.cameras, summary.units, summary.images) == ("rig folder", 2, 8, 16)
