@@ -6,6 +6,13 @@ import unicodedata
 from collections.abc import Collection, Iterator
 
 MANIFEST_NAME = "drive.json"
+TRUTH_NAME = "truth.tum"  # true poses, beside the manifest
+_TRUTH_PREFIX = "truth_"  # of other true values that are known of rendered drives, as files and folders
+
+
+def is_truth(path: str) -> bool:
+    """Return whether a path in a drive's folder is one of the true values that imports and renderings write there."""
+    return path == TRUTH_NAME or path.startswith(_TRUTH_PREFIX)
 
 
 def composed(path: str) -> str:

@@ -22,7 +22,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument(
         "--out", type=output_folder, required=True, help="folder of the drive (of the drives, if several)"
     )
-    parser.add_argument("--force", action="store_true", help="replace what is in --out")
+    parser.add_argument("--force", action="store_true", help="replace drives that are in --out")
     default = SynthOptions()
 
     def add(flag: str, kind: type, text: str, *, metavar: str | None = None, to: str | None = None) -> None:

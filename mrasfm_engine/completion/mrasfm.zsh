@@ -400,7 +400,7 @@ _shtab_mrasfm_standalone_defaults_added=0
 _shtab_mrasfm_synth_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
   "--out[folder of the drive (of the drives, if several)]:out:"
-  "--force[replace what is in --out]"
+  "--force[replace drives that are in --out]"
   "--cameras[cameras of the vehicle, 1 to 8 (default\: 6)]:cameras:"
   "--units[frames in which all cameras take an image (default\: 40)]:units:"
   "--drives[drives of the same world, an hour apart (default\: 1)]:drives:"

@@ -83,8 +83,8 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
 
 
 def require_free_folder(out: Path) -> None:
-    """Refuse a folder in which files that no map has made would be replaced, see `publishing.require_free`."""
-    require_free(out, (*REPLACED, *ALWAYS), result="map")
+    """Refuse a folder with files in which no map was made before, see `publishing.require_free`."""
+    require_free(out, result="map")
 
 
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import glob
+import json
 import os
 import secrets
 import shutil
@@ -65,15 +66,14 @@ def publishing(
         raise StorageError(f"{out} cannot be written: {error.strerror or error}", remedy=remedy) from error
 
 
-def require_free(out: Path, names: Sequence[str], *, result: str) -> None:
-    """Refuse a file, a drive, and a folder in which files that no result has made would be replaced.
+def require_free(out: Path, *, result: str) -> None:
+    """Refuse a file, a drive, and a folder with files in which no result was made before.
 
-    Any other folder with a result, or with finished stages of a run that was interrupted, is that result's.
+    A folder with a result, or with finished stages of a run that was interrupted, is that result's, whatever else lies
+    in it. Hidden files alone, as those that a file manager leaves, make no folder somebody's.
 
     Parameters
     ----------
-    names
-        Files and folders directly in `out` that the result replaces.
     result
         The kind of result, for the message: `scene` or `map`.
 
@@ -92,15 +92,23 @@ def require_free(out: Path, names: Sequence[str], *, result: str) -> None:
             remedy=remedy,
             code="bad-out-folder",
         )
-    if (out / COMPLETE_MARK).exists() or (out / CHECKPOINT_FOLDER).is_dir():
+    if _holds_result(out) or (out / CHECKPOINT_FOLDER).is_dir():
         return
-    taken = [name for name in names if os.path.lexists(out / name)]
-    if taken:
+    foreign = min((path for path in out.glob("*") if not path.name.startswith(".")), default=None)
+    if foreign is not None:
         raise InputError(
-            f"{out / taken[0]} was made by no {result}, and a {result} would replace it",
+            f"{foreign} was made by no {result}, and the files of a {result} would lie among what is in {out}",
             remedy=remedy,
             code="bad-out-folder",
         )
+
+
+def _holds_result(folder: Path) -> bool:
+    """Return whether the report in a folder is that of a scene or map, and not another program's."""
+    try:
+        return "summary" in dict(json.loads((folder / COMPLETE_MARK).read_bytes()))
+    except (OSError, ValueError, TypeError):
+        return False
 
 
 @contextmanager

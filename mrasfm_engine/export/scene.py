@@ -127,8 +127,8 @@ def write_scene(
 
 
 def require_free_folder(out: Path) -> None:
-    """Refuse a folder in which files that no scene has made would be replaced, see `publishing.require_free`."""
-    require_free(out, (*REPLACED, *ALWAYS), result="scene")
+    """Refuse a folder with files in which no scene was made before, see `publishing.require_free`."""
+    require_free(out, result="scene")
 
 
 def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:

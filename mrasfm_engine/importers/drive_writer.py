@@ -16,13 +16,12 @@ from pydantic import ValidationError
 from mrasfm_engine.errors import InputError, storage_error
 from mrasfm_engine.importers.recording import ImageKey, Recording, SourceImage, SourceUnit
 from mrasfm_engine.io.trajectory_file import format_tum
-from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, write_manifest
+from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, foreign_file, write_manifest
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import DriveManifest, Frame, FrameImage, Rig, RoughPose, RoughTrajectory
 from schemas.drive import FIELDS_OF_VERSION_2
+from schemas.file_names import TRUTH_NAME
 from schemas.parsing import file_problems
-
-TRUTH_NAME = "truth.tum"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,16 +85,26 @@ def _check_target(out: Path, *, force: bool) -> None:
         return
     if not out.is_dir():
         raise InputError(f"{out} is a file", remedy="Give the drive's folder another name.", code="output-in-use")
-    if not any(out.iterdir()):
+    first = min(out.iterdir(), default=None)
+    if first is None:
         return
     if not (out / MANIFEST_NAME).exists():
         raise InputError(
-            f"{out} holds files that are not a drive", remedy="Give a new or empty folder.", code="output-in-use"
+            f"{out} holds files that are not a drive, as {first.name}",
+            remedy="Give a new or empty folder.",
+            code="output-in-use",
         )
     if not force:
         raise InputError(
             f"{out} already holds a drive",
             remedy="Give another folder, or --force to replace it.",
+            code="output-in-use",
+        )
+    foreign = foreign_file(out)
+    if foreign is not None:
+        raise InputError(
+            f"{foreign} is no file of an imported drive, and would be removed with the drive in {out}",
+            remedy="Give another folder, or keep it elsewhere.",
             code="output-in-use",
         )
 

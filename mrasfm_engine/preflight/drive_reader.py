@@ -13,7 +13,7 @@ from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
 from mrasfm_engine.preflight.drive_check import check_drive, require_sound
 from mrasfm_engine.scene.drive import Drive
 from schemas import DriveManifest, parse_manifest, parse_new_manifest
-from schemas.file_names import MANIFEST_NAME
+from schemas.file_names import MANIFEST_NAME, is_truth
 from schemas.findings import Finding, Severity
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "Finding",
     "Severity",
     "check_drive",
+    "foreign_file",
     "read_drive",
     "read_image_gray",
     "read_image_rgb",
@@ -57,6 +58,12 @@ def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
         )
     manifest = read_manifest(folder / MANIFEST_NAME, is_new=is_new)
     return Drive(root=folder.resolve(), manifest=manifest_in_flu(manifest))
+
+
+def foreign_file(folder: Path) -> Path | None:
+    """The first file or folder in a drive's folder that no import and no rendering makes; None where there is none."""
+    made = (MANIFEST_NAME, "images", "masks")
+    return min((path for path in folder.iterdir() if path.name not in made and not is_truth(path.name)), default=None)
 
 
 def read_manifest(path: Path, *, is_new: bool) -> DriveManifest:

@@ -18,6 +18,7 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError, StorageError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.preflight.drive_reader import foreign_file
 from mrasfm_engine.scene.drive import pose_from_matrix
 from mrasfm_engine.synthetic import gnss
 from mrasfm_engine.synthetic.calibration import given_cameras
@@ -33,6 +34,7 @@ from mrasfm_engine.synthetic.streets import GROUND_GRID_M, Ground
 from mrasfm_engine.synthetic.world import StaticWorld, build_world
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Ints
 from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, RoughTrajectory
+from schemas.file_names import MANIFEST_NAME, TRUTH_NAME
 
 FIRST_EPOCH_US = 1_750_000_000_000_000
 _BETWEEN_DRIVES_US = 3_600_000_000
@@ -71,7 +73,7 @@ def render_drives(
         The drive's folder, or with several drives the folder of `drive_0`, `drive_1` and so on. It appears when
         everything is written, and not at all when something goes wrong.
     force
-        Replace what is there.
+        Replace drives that are there.
     rig
         Cameras in the place of the arrangement that the options ask for.
     progress
@@ -84,12 +86,11 @@ def render_drives(
     Raises
     ------
     InputError
-        When `out` holds files already.
+        When `out` holds files already, with `force` others than those of drives.
     StorageError
         When it cannot be written.
     """
-    if out.exists() and not force and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"{out} is not an empty folder", remedy="Choose another --out, or replace it with --force.")
+    _check_target(out, force=force)
     partial: Path | None = None
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -106,6 +107,27 @@ def render_drives(
         if partial is not None:
             shutil.rmtree(partial, ignore_errors=True)
     return [out / name for name in names]
+
+
+def _check_target(out: Path, *, force: bool) -> None:
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return
+    if not force:
+        raise InputError(f"{out} is not an empty folder", remedy="Choose another --out, or replace it with --force.")
+    foreign = _foreign_file(out) if out.is_dir() else out
+    if foreign is not None:
+        raise InputError(
+            f"{foreign} is no file of a rendered drive, and --force would remove it", remedy="Choose another --out."
+        )
+
+
+def _foreign_file(out: Path) -> Path | None:
+    """The first file that is of no drive, in the folder of one or of several; None where there is none."""
+    drives = [path for path in sorted(out.glob("drive_*")) if (path / MANIFEST_NAME).is_file()]
+    if not drives:
+        return foreign_file(out)
+    others = [path for path in sorted(out.iterdir()) if path not in drives]
+    return next(filter(None, [*others, *map(foreign_file, drives)]), None)
 
 
 def _replace(partial: Path, out: Path) -> None:
@@ -197,7 +219,7 @@ def _render_drive(
             (folder / "masks" / camera.name).mkdir(parents=True)
         if options.moving_masks:
             (folder / "truth_moving" / camera.name).mkdir(parents=True)
-    (folder / "drive.json").write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
+    (folder / MANIFEST_NAME).write_text(manifest.model_dump_json(exclude_none=True, indent=1) + "\n")
     _write_truth(folder, options, rig, shots, world_from_rig, unit_us, world.layout.ground)
     own_cars = _own_cars(options, lenses)
     for camera, own_car in zip(rig, own_cars, strict=True):
@@ -307,7 +329,7 @@ def _write_truth(
     for t, pose in zip(unit_us.tolist(), world_from_rig, strict=True):
         numbers = [*pose[:3, 3], *se3.quaternion_from_rotation(pose[:3, :3])]
         lines.append(" ".join([f"{t // 10**6}.{t % 10**6:06d}", *(f"{v:.9f}" for v in numbers)]))
-    (folder / "truth.tum").write_text("\n".join(lines) + "\n")
+    (folder / TRUTH_NAME).write_text("\n".join(lines) + "\n")
     calibration = {camera.name: pose_from_matrix(camera.rig_from_cam).model_dump() for camera in rig}
     (folder / "truth_calibration.json").write_text(json.dumps(calibration, indent=1) + "\n")
     images = {

@@ -637,17 +637,25 @@ def test_the_folder_of_a_drive_is_no_folder_for_a_scene(tmp_path: Path) -> None:
     require_free_folder(tmp_path / "scene")
 
 
-def test_a_folder_with_files_that_no_scene_has_made_is_refused(scene: Scene, tmp_path: Path) -> None:
-    """Somebody's own pictures, say, would be replaced; other files are kept beside a scene."""
-    (tmp_path / "notes.txt").touch()
-    require_free_folder(tmp_path)
-    require_free_folder(tmp_path / "new")
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "pictures" / "mine.jpg").touch()
-    with pytest.raises(InputError, match=r"pictures was made by no scene") as found:
+@pytest.mark.parametrize("name", ["pictures/mine.jpg", "notes.txt", "report.json"])
+def test_a_folder_with_files_that_no_scene_has_made_is_refused(tmp_path: Path, name: str) -> None:
+    """Somebody's own pictures, say, would be replaced; a scene's files are hard to tell from others."""
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text('{"version": 1, "formats": {}}')
+    first = tmp_path / name.partition("/")[0]
+    with pytest.raises(InputError, match=f"{first} was made by no scene") as found:
         reconstruct(tmp_path / "no drive", tmp_path, EngineConfig())
     assert found.value.code == "bad-out-folder"
+    assert found.value.remedy == "Give the scene a new or empty folder with --out."
+    require_free_folder(tmp_path / "new")
     (tmp_path / ".stages").mkdir()
     require_free_folder(tmp_path)  # of a run that was interrupted
+
+
+def test_a_folder_of_ours_stays_free(scene: Scene, tmp_path: Path) -> None:
+    """An empty one, one that only a file manager has opened, and a scene's, to which notes were added."""
+    (tmp_path / ".DS_Store").touch()
+    require_free_folder(tmp_path)
     write_scene(scene, tmp_path / "scene", {})
+    (tmp_path / "scene" / "notes.txt").touch()
     require_free_folder(tmp_path / "scene")

@@ -518,12 +518,23 @@ def test_output_is_not_overwritten(recording: Path, tmp_path: Path) -> None:
 def test_force_spares_what_is_no_drive(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "home").mkdir()
     (tmp_path / "home/thesis.txt").write_text("years of work")
-    assert "not a drive" in refused(recording, tmp_path / "home", force=True).what
+    assert "not a drive, as thesis.txt" in refused(recording, tmp_path / "home", force=True).what
     assert (tmp_path / "home/thesis.txt").exists()
     assert refused(recording, recording, force=True).code == "output-in-use"
     assert refused(recording, tmp_path, force=True).code == "output-in-use"
     (tmp_path / "file").touch()
     assert "is a file" in refused(recording, tmp_path / "file", force=True).what
+
+
+def test_force_spares_what_lies_in_the_folder_of_a_drive(recording: Path, tmp_path: Path) -> None:
+    """A scene, say, that was reconstructed into it: the drive alone is replaced."""
+    out = tmp_path / "drive"
+    import_recording(recording, out)
+    (out / "scene").mkdir()
+    error = refused(recording, out, force=True)
+    assert error.what.startswith(f"{out / 'scene'} is no file of an imported drive")
+    assert error.code == "output-in-use"
+    assert (out / "scene").is_dir()
 
 
 def test_empty_folder_may_be_filled(recording: Path, tmp_path: Path) -> None:

@@ -169,10 +169,27 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     options = small_options(**TINY, cameras=1, masks=False)
     with pytest.raises(InputError, match="not an empty folder"):
         render_drives(options, out)
+    with pytest.raises(InputError, match=r"precious.txt is no file of a rendered drive"):
+        render_drives(options, out, force=True)
+    (out / "precious.txt").unlink()
+    render_drives(replace(options, masks=True), out)
+    assert (out / "masks").is_dir()
     render_drives(options, out, force=True)
-    assert not (out / "precious.txt").exists()
     assert not (out / "masks").exists()
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
+
+
+def test_force_spares_what_lies_among_several_drives(tmp_path: Path) -> None:
+    out = tmp_path / "drives"
+    options = small_options(**TINY, cameras=1, masks=False, drives=2)
+    render_drives(options, out)
+    render_drives(options, out, force=True)
+    for scene in (out / "scene", out / "drive_1" / "scene"):
+        scene.mkdir()
+        with pytest.raises(InputError, match=f"{scene} is no file of a rendered drive"):
+            render_drives(options, out, force=True)
+        scene.rmdir()
+    assert (out / "drive_1" / "drive.json").is_file()
 
 
 def test_failure_leaves_nothing_behind(tmp_path: Path) -> None:
