@@ -7,12 +7,21 @@ from collections.abc import Collection, Iterator
 
 MANIFEST_NAME = "drive.json"
 TRUTH_NAME = "truth.tum"  # true poses, beside the manifest
-_TRUTH_PREFIX = "truth_"  # of other true values that are known of rendered drives, as files and folders
+_TRUTH = frozenset(
+    {
+        TRUTH_NAME,
+        "truth_calibration.json",
+        "truth_cameras.json",
+        "truth_moving",
+        "truth_own_car",
+        "truth_world.json",
+    }
+)  # files and folders beside the manifest of a drive that was imported or rendered
 
 
 def is_truth(path: str) -> bool:
     """Return whether a path in a drive's folder is one of the true values that imports and renderings write there."""
-    return path == TRUTH_NAME or path.startswith(_TRUTH_PREFIX)
+    return path.partition("/")[0] in _TRUTH
 
 
 def composed(path: str) -> str:

@@ -293,9 +293,10 @@ def test_archives_are_uploaded_once(open_console: Open, world: World, tmp_path: 
     page = open_console(world.api.url).new_page()
     client = world.api.client()
     log_in(page, world.api.url, client.key)
+    beside = {"my drive__.DS_Store": b"litter", "my drive__truth.tum": b"0 0 0 0 0 0 0 1"}
     for number, suffix in enumerate((".zip", ".tar", ".tar.gz"), 1):
         drive = tiny_drive(f"as {suffix}", seed=f"as {suffix}")
-        path = archive_of(drive, tmp_path / f"drive{suffix}", **{"my drive__.DS_Store": b"litter"})
+        path = archive_of(drive, tmp_path / f"drive{suffix}", **beside)
         assert sorted(upload(page, world.api.url, path)) == sorted(drive.files), suffix
         assert upload(page, world.api.url, path) == [], suffix
         drives = client.get("/v1/drives").json()["items"]

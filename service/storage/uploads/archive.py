@@ -81,9 +81,10 @@ def _unpack_zip(stream: BinaryIO, unpacking: _Unpacking, limits: ArchiveLimits) 
     entries = [(name, info) for name, info in archive.entries if not is_ignored(name)]
     for name, _ in entries:
         unpacking.names.add(name)
-    unpacking.names.resolve()  # before anything is unpacked
+    files = unpacking.names.resolve()  # before anything is unpacked
     for name, info in entries:
-        unpacking.write(name, info.file_size, archive.read(name, info))
+        if name in files:
+            unpacking.write(name, info.file_size, archive.read(name, info))
 
 
 def _unpack_tar(stream: BinaryIO, compression: str | None, unpacking: _Unpacking, limits: ArchiveLimits) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
-from schemas.file_names import MANIFEST_NAME, composed, portable_key
+from schemas.file_names import MANIFEST_NAME, composed, is_truth, portable_key
 from service.errors import EmptyArchive, ServiceError, UnexpectedFile, UnsafeArchive
 from service.storage.uploads.archive_errors import shown
 
@@ -84,27 +84,32 @@ class EntryNames:
             remedy = "Make the archive again with each file once, under names that differ in more than case."
             raise UnsafeArchive(f"entry {shown(name)} is in the archive {how}", remedy=remedy)
         self._names.append(name)
-        return self._file(name) is not None or self._file(without_top(name)) is not None
+        return self._file(name) is not None or (not is_truth(name) and self._file(without_top(name)) is not None)
 
     def resolve(self) -> dict[str, str]:
-        """The drive's file for each name that was added: one common top folder does not count.
+        """The drive's file for each name that was added and is one: true poses beside the manifest are none.
 
         Raises
         ------
         ServiceError
-            422 `empty-archive` if no name was added, 422 `unexpected-file` if one is no file of the drive.
+            422 `unexpected-file` if one is of no drive's folder, 422 `empty-archive` if none is the drive's.
         """
-        if not self._names:
+        paths = self._paths()
+        files = {name: file for name, path in paths.items() if (file := self._file(path)) is not None}
+        strange = [name for name, path in paths.items() if name not in files and not is_truth(path)]
+        if strange:
+            raise unexpected_files(strange, len(self._exact))
+        if not files:
             raise EmptyArchive("the archive holds no file", remedy="Put the drive's images into it.")
-        found = {name: self._file(name) for name in self._names}
-        if None in found.values() and self._has_common_top():
-            stripped = {name: self._file(without_top(name)) for name in self._names}
-            if any(stripped.values()):
-                found = stripped
-        files = {name: file for name, file in found.items() if file is not None}
-        if len(files) < len(found):
-            raise unexpected_files([name for name, file in found.items() if file is None], len(self._exact))
         return files
+
+    def _paths(self) -> dict[str, str]:
+        """Each entry's path in the drive's folder: one common top folder does not count."""
+        whole = {name: name for name in self._names}
+        if all(map(self._file, whole)) or not self._has_common_top():
+            return whole
+        stripped = {name: without_top(name) for name in self._names}
+        return stripped if any(map(self._file, stripped.values())) else whole
 
     def _file(self, name: str) -> str | None:
         if name in self._exact or name == MANIFEST_NAME:
@@ -113,7 +118,7 @@ class EntryNames:
 
     def _has_common_top(self) -> bool:
         tops = {name.partition("/")[0] for name in self._names}
-        return len(tops) == 1 and all("/" in name for name in self._names)
+        return len(tops) == 1 and all("/" in name and not is_truth(name) for name in self._names)
 
 
 def may_be_manifest(name: str) -> bool:

@@ -236,6 +236,27 @@ def test_files_that_are_not_in_the_manifest(unpacked: Unpacker, pack: Pack) -> N
     assert "extra/5.png" not in error.problem.detail
 
 
+@pytest.mark.parametrize("top", ["", "my drive/"])
+def test_the_truth_beside_the_manifest_is_ignored(unpacked: Unpacker, pack: Pack, top: str) -> None:
+    """As `mrasfm import` and `mrasfm synth` leave it in a drive's folder."""
+    truth = ("truth.tum", "truth_world.json", "truth_moving/front/0.png")
+    members = [(top + name, b"0 0 0 0 0 0 0 1") for name in truth]
+    assert list(unpacked(pack([*members, (f"{top}front/0.png", png())]))) == ["front/0.png"]
+    unpacked.refused(
+        pack([*members, (f"{top}front/truth.tum", b"1"), (f"{top}front/0.png", png())]),
+        "unexpected-file",
+        "front/truth.tum",
+    )
+    unpacked.refused(
+        pack(members), "unexpected-file" if top else "empty-archive", "my drive/truth.tum" if top else "no file"
+    )
+
+
+def test_images_that_are_called_truth_are_the_drives(unpacked: Unpacker, pack: Pack) -> None:
+    name = "truth_front/0.png"
+    assert list(unpacked(pack([(name, png()), ("truth.tum", b"1")]), [name])) == [name]
+
+
 def test_an_archive_without_files(unpacked: Unpacker, pack_plainly: Pack) -> None:
     unpacked.refused(pack_plainly([]), "empty-archive", "holds no file")
     unpacked.refused(pack_plainly([("front/", b""), ("__MACOSX/x", b"")]), "empty-archive", "holds no file")

@@ -12,6 +12,7 @@ import pytest
 from mrasfm_engine.commands import synth
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.preflight.drive_reader import foreign_file
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.synthetic import World, gnss, small_options
 from mrasfm_engine.synthetic.calibration import given_cameras
@@ -385,7 +386,8 @@ def test_own_car(tmp_path: Path) -> None:
     options = SynthOptions(cameras=4, **TINY)
     plain, own = tmp_path / "plain", tmp_path / "own"
     render_drives(options, plain)
-    render_drives(replace(options, own_car=True), own)
+    render_drives(replace(options, own_car=True, moving_masks=True), own)
+    assert foreign_file(own) is None, "an archive of it is taken, and --force replaces it"
     assert not (plain / TRUE_OWN_CAR_FOLDER).exists()
     assert {path.name for path in (own / TRUE_OWN_CAR_FOLDER).iterdir()} == {"front.png", "back.png"}
     for camera in ("front", "back"):
