@@ -20,6 +20,7 @@ from service.api.context import Context
 from service.api.credentials import secret_of
 from service.api.http.event_streams import EventStream
 from service.api.http.paging import MAX_CURSOR_CHARACTERS, MAX_LIMIT
+from service.api.http.query_parameters import refuse_unknown_parameters
 from service.api.http.request_bodies import request_sha256
 from service.database.tables import Job
 from service.domain import jobs
@@ -60,7 +61,8 @@ class _ApiKey(HTTPBearer):
         Raises
         ------
         ServiceError
-            401 without a valid key or session, 403 for a write that another site's page made with the cookie.
+            401 without a valid key or session, 403 for a write that another site's page made with the cookie, 422 for
+            query parameters that the route does not have.
         """
         context = await get_context(request)
         secret, project_id = secret_of(request), None
@@ -73,6 +75,7 @@ class _ApiKey(HTTPBearer):
                 remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
                 headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},
             )
+        refuse_unknown_parameters(request)  # not before: a key in the address is none, and answered as that
         return Caller(project_id)
 
 

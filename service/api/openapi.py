@@ -67,7 +67,7 @@ def openapi_page(app: FastAPI) -> dict[str, Any]:
         for path, method, operation in _operations(page):
             _correct_invalid(operation)
             if path.startswith("/v1/"):
-                _add_problems(operation, 503)
+                _add_problems(operation, 422, 503)
                 if method in _WRITING:
                     _add_problems(operation, 403)
             if "requestBody" in operation:

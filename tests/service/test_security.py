@@ -145,9 +145,9 @@ def test_head_is_get_without_a_body(api: Api, client: Client) -> None:
 
 
 def test_lists_show_nothing_foreign(client: Client, foreign: dict[str, str]) -> None:
-    for path in ("/v1/drives", "/v1/jobs", "/v1/scenes"):
-        for params in ({}, {"drive_id": foreign["drive_id"]}):
-            assert client.get(path, params=params).json() == {"items": [], "next": None}
+    of_drive = f"?drive_id={foreign['drive_id']}"
+    for path in ("/v1/drives", "/v1/jobs", "/v1/scenes", f"/v1/jobs{of_drive}", f"/v1/scenes{of_drive}"):
+        assert client.get(path).json() == {"items": [], "next": None}
 
 
 @pytest.mark.parametrize("row_id", ["", "x", "..", "drv_", "%00", "drv_%00", "ÿ", "drv_" + "f" * 500, "' OR 1=1 --"])
