@@ -48,7 +48,9 @@ def _commands() -> dict[str, EntryPoint]:
 
 
 def _parser_of(entries: Iterable[EntryPoint]) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="mrasfm", description=DESCRIPTION)
+    from schemas.command_line import CommandParser  # not for --help, which loads nothing
+
+    parser: argparse.ArgumentParser = CommandParser(prog="mrasfm", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=version("mrasfm"), help="print the version and exit")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for entry in entries:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import argparse
 import sys
 
+from schemas.command_line import CommandParser
 from service.commands import api, keys, migrate, projects, standalone
 
 
 def main() -> int:
     """Run one subcommand."""
-    parser = argparse.ArgumentParser(prog="python -m service")
+    parser: argparse.ArgumentParser = CommandParser(prog="python -m service")
     subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for command in (api, keys, migrate, projects, standalone):
         command.register(subparsers)

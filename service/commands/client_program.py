@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 
+from schemas.command_line import CommandParser
 from service.commands import client_resources, map, upload
 
 EXIT_UNREAD = 141  # as of a program that a broken pipe ends
@@ -13,7 +14,7 @@ EXIT_UNREAD = 141  # as of a program that a broken pipe ends
 
 def build_parser() -> argparse.ArgumentParser:
     """The parser of `mrasfm-client` with its subcommands."""
-    parser = argparse.ArgumentParser(prog="mrasfm-client", description="Use an MRASfM service.")
+    parser: argparse.ArgumentParser = CommandParser(prog="mrasfm-client", description="Use an MRASfM service.")
     subparsers = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     upload.register(subparsers)
     map.register(subparsers)

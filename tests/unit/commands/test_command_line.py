@@ -71,6 +71,32 @@ def test_a_command_that_does_not_exist(capsys: pytest.CaptureFixture[str]) -> No
     assert "invalid choice: 'reconstuct'" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "usage"),
+    [
+        (["keys", "create", "--bogus"], "mrasfm keys create"),
+        (["keys", "--bogus", "list"], "mrasfm keys"),
+        (["projects", "set", "default", "--bogus"], "mrasfm projects set"),
+        (["reconstruct", "drive", "--out", "scene", "--bogus"], "mrasfm reconstruct"),
+    ],
+)
+def test_an_unknown_option_shows_the_usage_of_its_command(
+    words: list[str], usage: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"usage: {usage} [-h]")
+    assert f"{usage}: error: unrecognized arguments: --bogus" in said
+
+
+def test_an_unknown_option_of_the_client_shows_the_usage_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        client_program.main(["list", "drives", "--bogus"])
+    assert capsys.readouterr().err.startswith("usage: mrasfm-client list [-h]")
+
+
 def test_results_can_be_had_as_json() -> None:
     def has_it(parser: argparse.ArgumentParser) -> bool:
         nested = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
