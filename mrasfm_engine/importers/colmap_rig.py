@@ -8,7 +8,7 @@ COLMAP knows no vehicle and no times.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +21,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.geotags import GeoTag, read_exif, read_geo_txt
 from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, gnss_of_vehicle
 from mrasfm_engine.importers.rig_folder import checked_camera
-from mrasfm_engine.importers.skipped_images import IMAGE_SUFFIXES
+from mrasfm_engine.importers.skipped_images import IMAGE_SUFFIXES, notes_of_images_without_a_camera
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.io.image_header import read_header
@@ -91,7 +91,9 @@ def read(
     rigs = read_document(file, RootModel[list[_Rig]], what="rig configuration", strict=False).root
     rig = choose_scene(_by_name(rigs), scene, folder)
     names = _names(rig, file)
-    images = _images(folder, rig, names, file)
+    root = folder / "images" if (folder / "images").is_dir() else folder
+    paths = _paths(root)
+    images = _images(root, paths, rig, names, file)
     turn = _rig_from_reference(rig, names, forward_camera, file)
     cameras = [_camera(name, camera, images[name], turn, file) for name, camera in zip(names, rig.cameras, strict=True)]
     frames = _frames(images)
@@ -111,7 +113,8 @@ def read(
         units=units,
         gnss=gnss,
         notes=[f"Rig frame: at the reference camera. {ahead} is taken to look level and straight ahead.", *time_note,
-               *notes, "Shutter: nothing says whether a camera reads its rows one after the other."],
+               *notes, *notes_of_images_without_a_camera(_without_a_camera(paths, rigs)),
+               "Shutter: nothing says whether a camera reads its rows one after the other."],
     )  # fmt: skip
 
 
@@ -137,17 +140,22 @@ def _names(rig: _Rig, file: Path) -> list[str]:
     return names
 
 
-def _images(folder: Path, rig: _Rig, names: list[str], file: Path) -> dict[str, dict[str, Path]]:
+def _paths(root: Path) -> dict[str, Path]:
+    """All images below a folder by their paths in it."""
+    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
+    return {path.relative_to(root).as_posix(): path for path in images}
+
+
+def _images(
+    root: Path, paths: Mapping[str, Path], rig: _Rig, names: list[str], file: Path
+) -> dict[str, dict[str, Path]]:
     """Images of each camera by their names after its prefix."""
-    root = folder / "images" if (folder / "images").is_dir() else folder
-    all_images = sorted(p for p in root.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file())
-    relative = {path.relative_to(root).as_posix(): path for path in all_images}
     found: dict[str, dict[str, Path]] = {}
     prefixes = [camera.image_prefix for camera in rig.cameras]
     # Images of cam10 begin with cam1, too: the longest prefix says whose an image is.
-    of = {k: max((prefix for prefix in prefixes if k.startswith(prefix)), key=len, default=None) for k in relative}
+    of = {k: max((prefix for prefix in prefixes if k.startswith(prefix)), key=len, default=None) for k in paths}
     for name, camera in zip(names, rig.cameras, strict=True):
-        own = {k.removeprefix(camera.image_prefix): p for k, p in relative.items() if of[k] == camera.image_prefix}
+        own = {k.removeprefix(camera.image_prefix): p for k, p in paths.items() if of[k] == camera.image_prefix}
         if not own:
             raise InputError(
                 f"rig configuration {file}: {root} has no images that begin with {camera.image_prefix!r}",
@@ -156,6 +164,12 @@ def _images(folder: Path, rig: _Rig, names: list[str], file: Path) -> dict[str, 
             )
         found[name] = own
     return found
+
+
+def _without_a_camera(paths: Iterable[str], rigs: Iterable[_Rig]) -> list[str]:
+    """Images that begin with the prefix of no camera, of whatever rig."""
+    prefixes = tuple(camera.image_prefix for rig in rigs for camera in rig.cameras)
+    return [path for path in paths if not path.startswith(prefixes)]
 
 
 def _reference(rig: _Rig, file: Path) -> int:

@@ -55,5 +55,11 @@ def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit])
     return [f"Frames without an image of a camera: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
 
 
+def notes_of_images_without_a_camera(paths: Sequence[str]) -> list[str]:
+    """A note that counts and names the images that begin with no camera's prefix; none where there are none."""
+    names = listed([*map(_short, paths)], MAX_NAMES)
+    return [f"Images that begin with no camera's image_prefix, left out: {len(paths)} ({names})."] if paths else []
+
+
 def _short(name: str) -> str:
     return name if len(name) <= MAX_CHARACTERS else name[:MAX_CHARACTERS] + "..."

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,28 @@ def test_images_without_positions(rig: Path, tmp_path: Path) -> None:
     assert [f.code for f in check_drive(read_drive(tmp_path / "drive"))] == []
     (rig / "images" / "rig1" / "left" / "image3.jpg").unlink()  # a frame of one camera
     assert import_recording(rig, tmp_path / "drive", options={"rate_hz": 10.0}, force=True).images == 2 * FRAMES - 1
+
+
+def test_images_under_no_prefix_are_counted_and_named(rig: Path, tmp_path: Path) -> None:
+    """Those of another rig in the same file are not among them."""
+    write_images(rig)
+    other = config()[0]
+    for camera in other["cameras"]:
+        camera["image_prefix"] = camera["image_prefix"].replace("rig1", "rig2")
+    (rig / "rig_config.json").write_text(json.dumps([*config(), other]))
+    options = {"rate_hz": 10.0}
+    source = rig / "images" / "rig1" / "front" / "image0.jpg"
+    for name in ("rig2/front/image0.jpg", *(f"rig1/rear/image{f}.jpg" for f in range(5))):
+        (rig / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (rig / "images" / name).write_bytes(source.read_bytes())
+    summary = import_recording(rig, tmp_path / "drive", scene="rig1", options=options)
+    assert summary.images == 2 * FRAMES
+    note = next(note for note in summary.notes if "image_prefix" in note)
+    named = "rig1/rear/image0.jpg, rig1/rear/image1.jpg, rig1/rear/image2.jpg and 2 more"
+    assert note == f"Images that begin with no camera's image_prefix, left out: 5 ({named})."
+    shutil.rmtree(rig / "images" / "rig1" / "rear")
+    summary = import_recording(rig, tmp_path / "drive", scene="rig1", options=options, force=True)
+    assert not any("image_prefix" in note for note in summary.notes)
 
 
 def edited(edit: Callable[[list[dict[str, Any]]], Any]) -> str:
