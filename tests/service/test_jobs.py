@@ -16,10 +16,11 @@ from sqlalchemy import insert
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.api.routes import job_views
-from service.database.tables import ApiKey, Job, JobMember, Project, new_id, now_us
+from service.database.tables import ApiKey, Job, Project, new_id, now_us
 from service.domain import jobs
 from service.domain.keys import revoke_key
 from tests.helpers.executed_statements import statements_of
+from tests.helpers.job_history import job_history
 from tests.helpers.live_api import LIMITS, Api, Client, problem_of, wait_until
 from tests.helpers.sqlite_steps import sqlite_steps
 from tests.helpers.tiny_drive import tiny_drive
@@ -169,30 +170,10 @@ def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
     assert len(client.get("/v1/jobs").json()["items"]) == 6
 
 
-def _history(client: Client, *members: int) -> list[str]:
-    """Jobs that have ended, of the newest first: an aggregation of as many members each, a reconstruction for 0."""
-    common = {"project_id": client.project_id, "state": "SUCCEEDED", "settings": {}}
-    kinds = [JobKind.AGGREGATION if count else JobKind.RECONSTRUCTION for count in members]
-    trees = [{**common, "id": new_id("job"), "kind": kind, "created_us": 1000 - i} for i, kind in enumerate(kinds)]
-    children = [
-        {**common, "id": new_id("job"), "kind": JobKind.RECONSTRUCTION, "created_us": 1} for _ in range(max(members))
-    ]
-    rows = [
-        {"job_id": tree["id"], "drive_id": f"drv_{i}", "name": f"d{i}", "child_id": children[i]["id"]}
-        for tree, count in zip(trees, members, strict=True)
-        for i in range(count)
-    ]
-    with client.api.database.write() as session:
-        session.execute(insert(Job), [*trees, *children])
-        session.flush()
-        session.execute(insert(JobMember), rows)
-    return [str(tree["id"]) for tree in trees]
-
-
 def test_a_page_of_jobs_ends_where_their_members_are_many(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_views, "CHILDREN_OF_PAGE", 10)
     client = api.client()
-    made = _history(client, 0, 4, 4, 0, 4, 11, 12, 0)
+    made = job_history(client, 0, 4, 4, 0, 4, 11, 12, 0)
     pages: list[list[str]] = []
     members: list[int] = []
     cursor = None
@@ -209,7 +190,7 @@ def test_a_page_of_jobs_ends_where_their_members_are_many(api: Api, monkeypatch:
 
 def test_a_page_of_jobs_reads_no_more_than_it_shows(api: Api) -> None:
     client = api.client()
-    _history(client, *[0] * 20, *[1500] * 3)
+    job_history(client, *[0] * 20, *[1500] * 3)
     with statements_of(api.context.database) as statements:
         page = client.get("/v1/jobs", params={"limit": 1000}).json()
     assert [len(shown["members"]) for shown in page["items"]] == [*[0] * 20, 1500]
@@ -327,7 +308,7 @@ def test_the_quota_of_jobs(api: Api) -> None:
     problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
 
 
-def test_the_quota_of_jobs_is_counted_without_the_history(api: Api) -> None:
+def test_the_quota_of_jobs_is_counted_without_thejob_history(api: Api) -> None:
     client = api.client()
     with sqlite_steps(api.database) as new, api.database.write() as session:
         jobs.require_places(session, client.project_id, 1)

@@ -12,8 +12,11 @@ from typing import Any
 import httpx
 import pytest
 
+from service.api.routes import job_views
 from service.database.tables import Job, JobEvent, now_us
 from service.domain.keys import revoke_key
+from tests.helpers.executed_statements import statements_of
+from tests.helpers.job_history import job_history
 from tests.helpers.live_api import GRACE_S, Api, Client, api_in_thread, problem_of, settings_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
@@ -86,6 +89,22 @@ def test_what_is_new_of_a_child_is_new_of_its_tree(api: Api, client: Client) -> 
             changed[data["id"]] = data
     states = {member["job_id"]: member["state"] for member in changed[tree["id"]]["members"]}
     assert states[child] == "RUNNING"
+
+
+def test_jobs_with_many_members_are_read_in_parts(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All come, in their order, and no more members are held at one time than a page of jobs shows."""
+    monkeypatch.setattr(job_views, "CHILDREN_OF_PAGE", 10)
+    client = api.client()
+    with stream(client) as events:
+        next(events)
+        made = job_history(client, 0, 4, 4, 0, 4, 11, 12, 0)
+        with statements_of(api.context.database) as statements:
+            with api.database.write() as session:
+                session.add_all(JobEvent(job_id=job_id, kind="state", data={}, created_us=now_us()) for job_id in made)
+            shown = [next(events)[2] for _ in made]
+    assert [job["id"] for job in shown] == made[::-1]
+    assert [len(job["members"]) for job in shown] == [0, 12, 11, 4, 0, 4, 4, 0]
+    assert sum("job_members.name" in statement for statement in statements) == 4, "of 12, 11, 4 + 4 and 4 members"
 
 
 def add_event(api: Api, job_id: str, *, before: int = 0, age_s: float = 0.0) -> int:

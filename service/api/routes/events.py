@@ -16,7 +16,7 @@ from service.api.context import Context
 from service.api.credentials import secret_of
 from service.api.dependencies import CallerDep, ContextDep, LastEventId, StreamDep
 from service.api.http.responses import gives, problems
-from service.api.routes.job_views import stalled_before_us, views_of
+from service.api.routes.job_views import count_shown_together, stalled_before_us, views_of
 from service.database.tables import Job, JobEvent, JobMember, JobState, now_us
 from service.domain.keys import KeyRing
 
@@ -27,7 +27,7 @@ READY, JOB, END = "ready", "job", "end"
 # is final once it is older than any transaction lives. They take milliseconds, and wait for one another for seconds.
 _OVERLAP_US = 30_000_000
 _EVENTS_AT_ONCE = 5000
-_JOBS_AT_ONCE = 50  # each may have a thousand members
+_JOBS_AT_ONCE = 50  # fewer where they have many members
 _EXAMPLE = JobResource.model_validate(example_of(JobResource)).model_dump_json()
 _EVENTS = {
     "text/event-stream": {
@@ -89,11 +89,16 @@ class _Reader:
             mine = (Job.project_id == self.project_id) & Job.id.in_(changed)
             return list(session.scalars(select(Job.id).where(mine).order_by(Job.created_us, Job.id)))
 
-    def views(self, job_ids: Sequence[str]) -> list[JobResource]:
-        """Jobs as they are now, without those that were deleted meanwhile."""
+    def views(self, job_ids: Sequence[str]) -> tuple[list[JobResource], Sequence[str]]:
+        """The first of these jobs as they are now, without those that were deleted meanwhile, and the ids of the rest.
+
+        Each may have a thousand members: as many are read at one time as a page of jobs shows.
+        """
         with self.context.database.read() as session:
-            found = session.scalars(select(Job).where(Job.id.in_(job_ids)).order_by(Job.created_us, Job.id)).all()
-            return views_of(session, found, self.context.settings)
+            count = count_shown_together(session, job_ids[:_JOBS_AT_ONCE])
+            asked = Job.id.in_(job_ids[:count])
+            found = session.scalars(select(Job).where(asked).order_by(Job.created_us, Job.id)).all()
+            return views_of(session, found, self.context.settings), job_ids[count:]
 
     def _changed(self, session: Session, position: _Position) -> set[str]:
         changed = self._with_events(session, position)
@@ -157,8 +162,10 @@ async def stream_events(
         if changed is None:
             yield ServerSentEvent(event=END, data={"reason": "the key or the session has ended"})
             return
-        for first in range(0, len(changed), _JOBS_AT_ONCE):
-            for job in await stream.look(reader.views, changed[first : first + _JOBS_AT_ONCE]):
+        left: Sequence[str] = changed
+        while left:
+            shown, left = await stream.look(reader.views, left)
+            for job in shown:
                 # Whoever goes away before the last one is shown all of them again.
                 is_last = job.id == changed[-1]
                 yield ServerSentEvent(event=JOB, id=str(position.floor if is_last else floor), data=job)

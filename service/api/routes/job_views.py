@@ -23,7 +23,7 @@ from service.domain import jobs
 from service.settings import Settings
 
 RETRY_AFTER_S = 2
-CHILDREN_OF_PAGE = 2000  # members and sub-maps that the jobs of a page show together, unless one alone has more
+CHILDREN_OF_PAGE = 2000  # members and sub-maps that jobs which are read together show, unless one alone has more
 
 
 def stalled_before_us(session: Session, settings: Settings) -> int:
@@ -74,13 +74,18 @@ def page_of_jobs(
     with the first job that was left out. Of those that are left out nothing but their places in the list is loaded.
     """
     found, following = newest(session, Job, project_id, cursor=cursor, limit=limit, places_only=True, drive_id=drive_id)
-    children = jobs.children_of(session, [job.id for job in found])
-    until = list(accumulate(children.get(job.id, 0) for job in found))
-    shown = [job for job, count in zip(found, until, strict=True) if count <= CHILDREN_OF_PAGE] or found[:1]
+    shown = found[: count_shown_together(session, [job.id for job in found])]
     if len(shown) < len(found):
         following = newest_after(shown[-1])
     session.scalars(select(Job).where(Job.id.in_([job.id for job in shown]))).all()  # completes those that are there
     return Page[JobResource](items=views_of(session, shown, settings), next=following)
+
+
+def count_shown_together(session: Session, job_ids: Sequence[str]) -> int:
+    """Number of the first of these jobs whose children together are not too many; one at least, if there is one."""
+    children = jobs.children_of(session, job_ids)
+    until = accumulate(children.get(job_id, 0) for job_id in job_ids)
+    return max(sum(count <= CHILDREN_OF_PAGE for count in until), min(1, len(job_ids)))
 
 
 def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
