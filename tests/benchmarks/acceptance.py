@@ -47,6 +47,7 @@ makes parts of it. The results of a line are kept with commit and date, see --ke
 | 40 | tests of service, workers and console that make test leaves out for their time |
 | 41 | a drive of 3,600 images by the command: memory, and the time of a unit beside a quarter of it |
 | 42 | the same drive on two workers beside one, and while workers are killed |
+| 43 | real drives varied so that their geometry stays: cameras turned, mirrored, backwards, elsewhere, in other light |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -112,6 +113,7 @@ from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import loop_over_borders, submaps
 from tests.benchmarks.surround_peers import surround_peers
 from tests.benchmarks.table import Figure, failed, load, save, show
+from tests.benchmarks.variations import varied_pairs, varied_surround
 from tests.benchmarks.vehicles import vehicles
 from tests.benchmarks.whole_command import whole_command
 from tests.benchmarks.wrong_manifests import wrong_manifests
@@ -177,6 +179,7 @@ LINES = {
     "40": Line(timed=(slow_tests_of_service,)),
     "41": Line(timed=(memory_of_long_drives,)),
     "42": Line(timed=(on_several_workers,)),
+    "43": Line(untimed=(varied_surround, varied_pairs)),
 }
 # Accuracy on real drives, speed of mapping, of the adjustment and of the whole command, and drives with gaps.
 HEADLINE = ("1", "2", "13", "28", "35")
