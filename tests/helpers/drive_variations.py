@@ -54,9 +54,10 @@ class VariedDrive:
         """
         unknown = self.manifest.keys() - _VARIED
         unknown = unknown.union(*(camera.keys() - _VARIED_OF_CAMERA for camera in self.cameras))
-        models = {camera["model"] for camera in self.cameras} - {"PINHOLE"}
-        if unknown or models or self.manifest["rig"]["body_axes"] != "flu":
-            raise ValueError(f"no drive of plain pinholes: {sorted(unknown | models)}")
+        unknown |= {camera["model"] for camera in self.cameras} - {"PINHOLE"}
+        unknown |= {self.manifest["rig"].get("body_axes", "flu")} - {"flu"}
+        if unknown:
+            raise ValueError(f"variations would leave {', '.join(sorted(unknown))} as it is")
 
     @classmethod
     def read(cls, folder: Path) -> VariedDrive:

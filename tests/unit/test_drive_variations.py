@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -223,10 +223,20 @@ def test_drives_are_written_with_their_changed_images(
         assert (out / image.file).samefile(source / before.file) == (image.camera != 0)
 
 
-@pytest.mark.parametrize(("key", "value"), [("readout_us", 20_000), ("model", "OPENCV")])
-def test_drives_that_variations_do_not_know_are_refused(drive: VariedDrive, key: str, value: object) -> None:
-    drive.cameras[0][key] = value
-    with pytest.raises(ValueError, match=str(value) if key == "model" else key):
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda manifest: manifest["rig"]["cameras"][0].update(readout_us=20_000), "readout_us"),
+        (lambda manifest: manifest["rig"]["cameras"][1].update(model="OPENCV"), "OPENCV"),
+        (lambda manifest: manifest["rig"].update(body_axes="rdf"), "rdf"),
+        (lambda manifest: manifest.update(rough_poses={}), "rough_poses"),
+    ],
+)
+def test_drives_that_variations_would_not_keep_right_are_refused(
+    drive: VariedDrive, change: Callable[[dict[str, Any]], None], named: str
+) -> None:
+    change(drive.manifest)
+    with pytest.raises(ValueError, match=named):
         VariedDrive(manifest=drive.manifest, truth=drive.truth)
 
 
