@@ -10,7 +10,7 @@ import scipy.linalg
 from mrasfm_engine.bundle_adjustment.priors import ReadoutPrior
 from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, READOUT, TIME, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Eliminated, ReducedCameraSystem
-from mrasfm_engine.bundle_adjustment.shared_errors import shared_error_covariance
+from mrasfm_engine.bundle_adjustment.shared_errors import SharedErrors, find_shared_errors
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -35,6 +35,7 @@ class Covariances:
     scale_with_calibration: Floats
     times_s2: Floats  # (c, c) of the free cameras' time offsets, (0, 0) where none has a place
     times_of_independent_errors_s2: Floats  # (c, c) the same as the adjustment weighs them
+    sigma_factor: float  # on standard deviations of observations beside priors, see `SharedErrors`
 
     def with_scale_error(self, sigma: float) -> Covariances:
         """The same with an error more of the scale, relative, and with that of all positions."""
@@ -81,6 +82,7 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
         scale_with_calibration=found.scale_with_cameras[poses[0].ravel()],
         times_s2=found.cameras[times],
         times_of_independent_errors_s2=found.cameras_of_independent_errors[times],
+        sigma_factor=found.sigma_factor,
     )
     if not np.isfinite(found.sigma_scale):
         return replace(result, sigma_scale=found.sigma_scale)
@@ -97,6 +99,7 @@ class _Marginals:
     sigma_scale: float
     sigma_scale_of_independent_errors: float
     by_scale_m: Floats  # (free units, 3)
+    sigma_factor: float = 1.0
 
 
 def _regular_marginals(
@@ -116,13 +119,12 @@ def _regular_marginals(
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
     of_independent = joint[-1, -1]
-    if shared_errors:
-        joint = _with_shared_errors(problem, state, unseen, joint)
-    joint = joint + of_readouts
+    found = _shared_errors(problem, state, unseen) if shared_errors else None
+    joint = (joint if found is None else found.covariance) + of_readouts
     loose = eliminated.free[unseen[split:][eliminated.free]]
     covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
-    for covariance, found in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
-        covariance[np.ix_(eliminated.free, eliminated.free)] = found
+    for covariance, own in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
+        covariance[np.ix_(eliminated.free, eliminated.free)] = own
         covariance[loose, loose] = np.inf
     scale = scale_of_independent = float("nan")
     if np.isinf(variance[:, 3:]).any():
@@ -137,22 +139,22 @@ def _regular_marginals(
         sigma_scale=scale,
         sigma_scale_of_independent_errors=scale_of_independent,
         by_scale_m=columns[:split, -1].reshape(-1, UNIT_DOF)[:, 3:] / max(of_independent, 1e-30),
+        sigma_factor=1.0 if found is None else found.sigma_factor,
     )
 
 
-def _with_shared_errors(problem: Problem, state: State, unseen: Bools, covariance: Floats) -> Floats:
-    """Covariance (f + 1, f + 1) of the cameras' unknowns and the scale, whatever errors the observations share.
+def _shared_errors(problem: Problem, state: State, unseen: Bools) -> SharedErrors | None:
+    """Errors that observations share, by the cameras' unknowns and the scale: covariances are (f + 1, f + 1).
 
-    That of independent errors where they are too few to tell, or do not determine all by the curvature of their loss.
+    None where they are too few to tell, or do not determine all by the curvature of their loss.
     """
     curved = problem.with_curvature()
     system = curved.normal_equations(state, 0.0)
     eliminated = system.eliminate(unseen.astype(np.float64))
     if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
-        return covariance
-    columns = _of_functionals(curved, state, eliminated, eliminated.inverse_of_border())[0]
-    found = shared_error_covariance(curved, state, system, columns)
-    return covariance if found is None else found
+        return None
+    columns, joint, _ = _of_functionals(curved, state, eliminated, eliminated.inverse_of_border())
+    return find_shared_errors(curved, state, system, columns, joint)
 
 
 def _of_functionals(

@@ -16,13 +16,22 @@ make up for. Scores of points are those of independent errors, and of what a poi
 as far as they exceed it [two ways of clustering: Cameron, Gelbach and Miller, Robust Inference With Multiway
 Clustering, Journal of Business and Economic Statistics 2011]. They are of whole units: a unit's pose has absorbed what
 its images share.
+
+Where images stand beside priors, such errors are in the estimate too: weighed as independent ones, images overrule
+priors that know more. One factor on the standard deviation of all observations mends the balance [the magnitude
+adjustment: Ribatet, Cooley and Davison, Bayesian Inference from Composite Likelihoods, Statistica Sinica 2012]. Errors
+are shared in some directions more than in others: the factor is the one whose estimate errs least.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import ndtr, stdtrit
 
+from mrasfm_engine.bundle_adjustment.priors import ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.solver import Problem
@@ -36,10 +45,18 @@ SINGULAR = 1e-9  # eigenvalues of a correlation below this are rounding
 POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
 
 
-def shared_error_covariance(
-    problem: Problem, state: State, system: ReducedCameraSystem, columns: Floats
-) -> Floats | None:
-    """Covariance (k, k) of k functionals f of the reduced vector; None where there are too few units to tell it.
+@dataclass(frozen=True)
+class SharedErrors:
+    """Errors that observations share, by what they leave unknown of k functionals of the reduced vector."""
+
+    covariance: Floats  # (k, k) of the functionals
+    sigma_factor: float  # on standard deviations of observations, with which the functionals err least
+
+
+def find_shared_errors(
+    problem: Problem, state: State, system: ReducedCameraSystem, columns: Floats, of_independent: Floats
+) -> SharedErrors | None:
+    """Errors by what k functionals f of the reduced vector show; None where there are too few units to tell them.
 
     Parameters
     ----------
@@ -49,6 +66,8 @@ def shared_error_covariance(
         A solution and its normal equations, without damping.
     columns
         (n, k) D^-1 f of every functional.
+    of_independent
+        (k, k) f' D^-1 f of all functionals.
     """
     observes = np.bincount(problem.observations.unit) > 0
     if observes.sum() < MIN_UNITS or not columns.any():
@@ -59,7 +78,48 @@ def shared_error_covariance(
     covariance = of_points.T @ of_points + _of_terms(problem, state, columns)
     known = np.diagonal(covariance) > 0.0
     covariance[np.ix_(known, known)] = _widened(covariance[np.ix_(known, known)], of_units[:, known])
-    return covariance
+    of_priors = _of_terms(replace(problem, terms=_known_beforehand(problem)), state, columns)
+    return SharedErrors(covariance, _best_sigma_factor(covariance, of_independent, of_priors))
+
+
+def _known_beforehand(problem: Problem) -> list[Term]:
+    """Terms whose weight does not follow that of the images."""
+    return [term for term in problem.terms if not isinstance(term, ScalePrior)]
+
+
+def _best_sigma_factor(covariance: Floats, of_independent: Floats, of_priors: Floats) -> float:
+    """The `sigma_factor` of `SharedErrors`, one where errors share nothing.
+
+    The sum of squared errors is smallest with it, in standard deviations of the estimate that weighs each direction by
+    what it knows. Of a direction that images alone tell, or priors alone, no factor changes that much.
+
+    Parameters
+    ----------
+    covariance, of_independent, of_priors
+        (k, k) with shared errors, without, and what priors bring into it.
+    """
+    known = np.diagonal(of_independent) > 0.0
+    sigma = np.sqrt(np.diagonal(of_independent)[known])
+    independent, found, priors = (
+        part[np.ix_(known, known)] / sigma / sigma[:, None] for part in (of_independent, covariance, of_priors)
+    )
+    # In axes in which the information of images and of priors is diagonal, and their sum is one.
+    values, vectors = np.linalg.eigh(independent)
+    white = vectors / np.sqrt(np.maximum(values, SINGULAR))
+    share, axes = np.linalg.eigh(white.T @ priors @ white)
+    share, white = np.clip(share, 0.0, 1.0), white @ axes
+    scores = white.T @ found @ white - np.diag(share)  # covariance of those of images
+    told = (1.0 - share)[:, None] * np.linalg.pinv(scores, rcond=SINGULAR, hermitian=True) * (1.0 - share)
+    metric = told + np.diag(share)
+
+    def squared_errors(log_factor: float) -> float:
+        weight = np.exp(-2.0 * log_factor)
+        gain = 1.0 / (weight * (1.0 - share) + share)
+        return float((gain[:, None] * (weight**2 * scores + np.diag(share)) * gain * metric).sum())
+
+    most = 0.5 * np.log(max(float(np.linalg.eigvalsh(scores)[-1]), 1.0))
+    best = minimize_scalar(squared_errors, bounds=(0.0, most), method="bounded") if most > 0.0 else None
+    return 1.0 if best is None or best.fun >= squared_errors(0.0) else float(np.exp(best.x))
 
 
 def _widened(covariance: Floats, scores: Floats) -> Floats:

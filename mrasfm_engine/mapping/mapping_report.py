@@ -175,6 +175,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "units": refinement.units_dropped,
         },
         "sigma_observation_px": refinement.sigma_px,
+        "sigma_factor_of_shared_errors": refinement.sigma_factor,
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
             "adjusted": refinement.calibration.free,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -136,7 +137,7 @@ def _decide_what_varies(
             free_units=free_units,
             terms=terms_of(mapper, result),
             georeferenced=result.georeferenced,
-            options=solver_options(mapper, result.sigma_px),
+            options=solver_options(mapper, result),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
     few = not result.georeferenced and _reassesses(mapper) and has_few_units(mapper)
@@ -152,7 +153,7 @@ def _decide_what_varies(
             free_units=free_units,
             free_times=result.recalibrated if result.times_vary else None,
             terms=terms_of(mapper, result),
-            options=solver_options(mapper, result.sigma_px),
+            options=solver_options(mapper, result),
         )
     result.intrinsics = held_intrinsics(mapper)
     if not is_calibrated and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
@@ -161,7 +162,7 @@ def _decide_what_varies(
             mapper,
             free_units=free_units,
             terms=terms_of(mapper, result),
-            options=solver_options(mapper, result.sigma_px),
+            options=solver_options(mapper, result),
             cancel=cancel,
         )
 
@@ -176,6 +177,8 @@ def _adjust_in_rounds(
     while not is_last:
         result.sigma_px = observation_sigma_px(mapper)
         is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
+        if is_last:
+            _weigh_shared_errors(mapper, result)
         offset_s = mapper.state.camera_time_offset_s
         _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
         steady = _reassess(mapper, result) and offsets_are_steady(mapper, offset_s)
@@ -191,6 +194,21 @@ def _adjust_in_rounds(
         if progress is not None:
             progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
+
+
+def _weigh_shared_errors(mapper: Mapper, result: Refinement) -> None:
+    """Let observations weigh as little beside priors as the errors leave them that they share.
+
+    The residual on given rotations keeps its share against the images.
+    """
+    if not result.recalibrated.any() or has_few_units(mapper):
+        return
+    certainty = certainty_of(mapper, result)
+    if certainty is None:
+        return
+    result.sigma_factor = certainty.sigma_factor
+    if result.given_scale is not None:
+        result.given_scale = replace(result.given_scale, sigma=result.given_scale.sigma * result.sigma_factor)
 
 
 def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -> None:
@@ -273,7 +291,8 @@ def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel 
     settings, absolute = mapper.config.bundle_adjustment, result.absolute
     if mapper.drive.has_single_camera or not (_reassesses(mapper) and settings.camera_set_adjustment):
         return
-    free_units, options = free_units_of(mapper, absolute), solver_options(mapper, observation_sigma_px(mapper))
+    result.sigma_px = observation_sigma_px(mapper)
+    free_units, options = free_units_of(mapper, absolute), solver_options(mapper, result)
     terms = absolute.terms(mapper)
     result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
     mapper.complete()
@@ -310,7 +329,7 @@ def _adjust(
             free_intrinsics=None if result.intrinsics is None else result.intrinsics.free,
             free_times=result.recalibrated if result.times_vary else None,
             terms=terms,
-            options=solver_options(mapper, result.sigma_px, rough=rough),
+            options=solver_options(mapper, result, rough=rough),
             an_image=mapper.config.mapping.pose_observations if rough else 0,
             cancel=cancel,
         )
@@ -328,7 +347,7 @@ def _adjust_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, c
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
         free_times=np.full(len(mapper.camera_kind), times_may_vary(mapper)),
         terms=terms_of_all_cameras(mapper, result),
-        options=solver_options(mapper, result.sigma_px),
+        options=solver_options(mapper, result),
         cancel=cancel,
     )
 
@@ -376,7 +395,7 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
         free_units,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
         terms=terms_of(mapper, result),
-        options=solver_options(mapper, result.sigma_px),
+        options=solver_options(mapper, result),
     )
     found = observed_directions(mapper, covariances(problem, problem.state, shared_errors=False))
     wrong = np.zeros_like(result.recalibrated)

@@ -44,6 +44,7 @@ class Refinement:
     """Result of the refinement."""
 
     sigma_px: float = 1.0
+    sigma_factor: float = 1.0  # on it beside priors, for what observations share, see `shared_errors`
     absolute: AbsolutePriors = field(default_factory=AbsolutePriors)
     calibration: CalibrationDecision = field(default_factory=lambda: CalibrationDecision(False, ""))
     scale_of_rough_poses: float | None = None  # factor on the rig's lengths as given, where they contradict these
@@ -89,15 +90,18 @@ class Refinement:
         return self.absolute.positions is not None
 
 
-def solver_options(mapper: Mapper, sigma_px: float, *, rough: bool = False) -> SolverOptions:
-    """Options of adjustments whose observations have that standard deviation; `rough` ones end earlier."""
+def solver_options(mapper: Mapper, result: Refinement, *, rough: bool = False) -> SolverOptions:
+    """Options of adjustments whose observations err as is known by now; `rough` ones end earlier.
+
+    What observations share takes weight from all of them beside the priors. In pixels their loss stays as it is.
+    """
     return SolverOptions(
         max_iterations=15 if rough else 40,
         function_tolerance=TOLERANCE,
         decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
         initial_damping=INITIAL_DAMPING,
-        loss_scale=mapper.config.bundle_adjustment.loss_scale,
-        sigma_px=sigma_px,
+        loss_scale=mapper.config.bundle_adjustment.loss_scale / result.sigma_factor,
+        sigma_px=result.sigma_px * result.sigma_factor,
         threads=mapper.config.threads,
     )
 
@@ -168,7 +172,7 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
         free_times=np.full(len(mapper.camera_kind), times_vary),
         free_readouts=undeclared_readouts(mapper) & times_vary,
         terms=terms,
-        options=solver_options(mapper, result.sigma_px),
+        options=solver_options(mapper, result),
     )
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return None

@@ -6,9 +6,11 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mrasfm_engine.cli import main
+from mrasfm_engine.config import BundleAdjustmentConfig
 from schemas.artifacts import CHECKPOINTED
 from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, read_report
 
@@ -52,3 +54,25 @@ def test_latitude_and_longitude_exchanged(kitti02: Path, variant_of: Callable[[P
         assert "georeferenced:    no (" in result.out
     else:
         assert "latitude" in result.err
+
+
+@pytest.mark.slow
+def test_cameras_that_share_no_view_stay_where_they_were_given(shared_data: Path, tmp_path: Path, mrasfm: Run) -> None:
+    """Seven metres of way tell hardly where three cameras are that look apart; what traffic and interpolation leave in
+    the images would move the one behind by six sigmas of its prior.
+    """
+    cameras = "front_camera,left_camera,back_camera"
+    drive, scene = tmp_path / "drive", tmp_path / "scene"
+    imported = mrasfm("import", shared_data / "pandaset_002", "--frames", "26:52", "--cameras", cameras, "--out", drive)
+    assert imported.code == 0
+    assert mrasfm("reconstruct", drive, "--out", scene, *WITHOUT_PICTURES).code == 0
+    calibration = json.loads((scene / "calibration.json").read_text())["cameras"]
+    places_m = {
+        which: np.array([camera[which]["rig_from_cam"]["translation_m"] for camera in calibration.values()])
+        for which in ("given", "refined")
+    }
+    moved_m = places_m["refined"] - places_m["given"]
+    assert np.linalg.norm(moved_m - moved_m.mean(0), axis=1).max() < 3 * BundleAdjustmentConfig().sigma_translation_m
+    errors = json.loads(mrasfm("evaluate", scene, "--truth", drive / "truth.tum", "--json").out)
+    assert errors["registered_images"] == errors["total_images"] == 78
+    assert 0 < errors["metric"]["rmse_m"] < 0.02

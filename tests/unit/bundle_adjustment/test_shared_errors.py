@@ -9,12 +9,14 @@ from mrasfm_engine.bundle_adjustment import shared_errors
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
+from mrasfm_engine.geometry import se3
 from mrasfm_engine.scene.state import State
 from tests.helpers.slow import slow
 from tests.helpers.small_problems import make_case
 
 UNITS, CAMERAS, NOISE_PX, SHARED_PX = 24, 3, 0.5, 1.5
 NO_LOSS = 1e3  # of residuals of any size
+PRIOR_RAD, PRIOR_M = np.radians(0.02), 0.004  # better than what images tell whose errors are shared
 
 
 def adjusted(
@@ -105,6 +107,46 @@ def test_errors_that_few_observations_share_are_covered(units: int) -> None:
     assert 0.25 < np.sqrt(np.mean(np.square(shared))) < 1.2
     assert np.abs(shared).max() < 3.5
     assert 0.7 < np.sqrt(np.mean(np.square(independent))) < 1.4
+
+
+def test_priors_that_know_more_are_not_overruled() -> None:
+    """Weighed as independent, errors that images share would turn cameras by more than their priors are off."""
+    before, after = [], []
+    for seed in range(6):
+        truth, problem, _ = adjusted(seed, shared_px=SHARED_PX)
+        problem = replace(problem, terms=[drawn_prior(truth, seed)])
+        solution = solve(problem)[0]
+        before.append(rotation_error(truth, problem, solution))
+        factor = covariances(problem, solution).sigma_factor
+        assert factor > 2.0
+        lighter = replace(problem.options, sigma_px=factor * NOISE_PX, loss_scale=NO_LOSS / factor)
+        after.append(rotation_error(truth, problem, solve(replace(problem, options=lighter))[0]))
+    assert np.sqrt(np.mean(np.square(after))) < 0.8 * np.sqrt(np.mean(np.square(before)))
+
+
+def test_independent_errors_keep_their_weight() -> None:
+    truth, problem, _ = adjusted(0, shared_px=0.0)
+    problem = replace(problem, terms=[drawn_prior(truth, 0)])
+    assert 1.0 <= covariances(problem, solve(problem)[0]).sigma_factor < 1.05
+
+
+def drawn_prior(truth: State, seed: int) -> CalibrationPrior:
+    """A prior that is off by what it states."""
+    off = np.random.default_rng(100 + seed).normal(size=(CAMERAS, 6))
+    return CalibrationPrior(
+        rotation=se3.exp_so3(PRIOR_RAD * off[:, :3]) @ truth.camera_rotation,
+        position_m=truth.camera_position_m + PRIOR_M * off[:, 3:],
+        sigma_rotation_rad=np.full(CAMERAS, PRIOR_RAD),
+        sigma_translation_m=np.full(CAMERAS, PRIOR_M),
+    )
+
+
+def rotation_error(truth: State, problem: Problem, solution: State) -> np.ndarray:
+    prior = problem.terms[0]
+    assert isinstance(prior, CalibrationPrior)
+    error = replace(prior, rotation=truth.camera_rotation, position_m=truth.camera_position_m).corrections(solution)
+    result: np.ndarray = (error - error.mean(0))[:, :3]
+    return result
 
 
 def test_three_units_tell_no_covariance_of_their_errors(monkeypatch: pytest.MonkeyPatch) -> None:
