@@ -211,6 +211,7 @@ def adjust_transform(
     sigma2 = max(0.25, float(np.median(errors_px**2)) / (2 * np.log(2)) if len(errors_px) else 1.0)
     problem = replace(problem, observations=thinned(problem.observations, problem.layout.unit_slot >= 0))
     covariance = sets.covariances(problem.normal_equations(solution, 0.0), solution)[0] * sigma2 * CORRELATION
+    covariance = covariance + _by_calibrations(problem, solution, sets, _sigmas_of_cameras(assembly))
     return RefinedSeam(
         a_from_b=se3.inverse(poses[0]) @ poses[1],
         covariance=covariance,
@@ -218,6 +219,33 @@ def adjust_transform(
         errors_px=errors_px,
         report=report,
     )
+
+
+def _sigmas_of_cameras(assembly: Assembly) -> Floats:
+    """Sigmas (c, 6) of all scenes' cameras, rotation (rad) and translation (m); zero where a scene states none."""
+    parts = []
+    for scene in assembly.scenes:
+        known = scene.certainty_of_cameras
+        parts.append(np.zeros((len(scene.drive.cameras), 6)) if known is None else known[0])
+    return np.concatenate(parts)
+
+
+def _by_calibrations(problem: Problem, state: State, sets: RigidGroups, sigma: Floats) -> Floats:
+    """Covariance (6, 6) of the set's step by errors of the cameras, of standard deviations sigma (c, 6).
+
+    A camera that looks elsewhere than its scene thinks has its points where the other scene does not: it turns and
+    shifts the seam, and no residual shows it [a consider covariance: Bierman, Factorization Methods for Discrete
+    Sequential Estimation, 1977].
+    """
+    layout = Layout.from_free(problem.layout.unit_slot >= 0, np.ones(len(sigma), dtype=np.bool_))
+    system = replace(problem, layout=layout).normal_equations(state, 0.0)
+    by_error = sets.with_cameras(system, state).reshape(-1, len(sigma), layout.camera_dof)[:, :, :6] * sigma
+    try:
+        moved = np.linalg.solve(sets.condense(system, state)[0], by_error.reshape(len(by_error), -1))
+    except np.linalg.LinAlgError:
+        return np.full((len(by_error), len(by_error)), np.inf)
+    result: Floats = moved @ moved.T
+    return result
 
 
 def scale_ratio(assembly: Assembly, a_from_b: Floats, shared: Shared) -> tuple[float, float]:

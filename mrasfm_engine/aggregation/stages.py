@@ -35,7 +35,7 @@ from schemas.findings import Finding, as_json, listed, warning
 
 FAR_APART_M = 50_000.0
 MIN_DRIVES = 2
-SEAM_VERSION = 4  # see `mrasfm_engine.stages.VERSIONS`
+SEAM_VERSION = 5  # see `mrasfm_engine.stages.VERSIONS`
 
 
 @dataclass

@@ -83,6 +83,14 @@ class RigidGroups:
         matrix = matrix - system.auxiliary.eliminated(with_units.reshape(self.size, states))
         return matrix, gradient.ravel(), diagonal.ravel()
 
+    def with_cameras(self, system: ReducedCameraSystem, state: State) -> Floats:
+        """Block (6 s, d c) of the matrix between the sets and the free cameras."""
+        of, maps = self.unit_from_set_steps(state, system.layout)
+        by_unit = np.einsum("nji,cndj->nicd", maps, system.border)
+        square = np.zeros((self.count, *by_unit.shape[1:]))
+        np.add.at(square, of, by_unit)
+        return square.reshape(self.size, -1)
+
     def step(self, system: ReducedCameraSystem, state: State, damping: float) -> Floats | None:
         """The damped step of the sets, as steps (6 units,) of the units; None where not positive definite."""
         matrix, gradient, diagonal = self.condense(system, state)

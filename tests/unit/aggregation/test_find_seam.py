@@ -103,6 +103,31 @@ def test_a_seam_is_found_and_says_how_good_it_is(found: Seam, a: Driven, b: Driv
     assert np.array_equal(again.a_from_b, found.a_from_b)
 
 
+def test_what_cameras_are_off_by_is_in_the_sigma_of_a_seam(street: Street, folder: Path) -> None:
+    """A camera that looks elsewhere than its scene thinks turns and shifts the seam, and no residual shows it."""
+    shifts, turns = [], []
+    for seed in range(0, 6, 2):
+        a, b = (
+            drive_along(
+                street,
+                folder / f"off {seed + k}",
+                way,
+                cameras=3,
+                cameras_off_deg=0.3,
+                lateral_m=0.7 * k,
+                seed=seed + k,
+            )
+            for k, way in enumerate((WAY_A, WAY_B))
+        )
+        seam = seam_of(a, b)
+        assert seam.accepted, seam.reason
+        shift_m, turn_deg = error(seam, a, b)
+        shifts.append(shift_m / seam.quality["sigma_translation_m"])
+        turns.append(turn_deg / seam.quality["sigma_rotation_deg"])
+    assert 0.2 < np.sqrt(np.mean(np.square(shifts))) < 2.0
+    assert 0.2 < np.sqrt(np.mean(np.square(turns))) < 2.0
+
+
 def test_a_drive_the_other_way_is_joined_by_its_back_camera(street: Street, folder: Path, a: Driven) -> None:
     back = drive_along(street, folder / "back", WAY_B[::-1], lateral_m=-0.5, back=True, bias_m=(-2, 1, 0), seed=2)
     seam = seam_of(a, back)

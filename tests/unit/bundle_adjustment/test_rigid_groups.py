@@ -61,6 +61,19 @@ def test_condensed_matrix_is_the_units_matrix_between_the_maps(case: Case) -> No
     assert np.allclose(matrix, whole.T @ system.matrix @ whole, rtol=1e-9, atol=1e-6)
 
 
+def test_the_block_with_cameras_is_the_units_between_the_maps() -> None:
+    case = make_case(units=8, free_units=(OF_UNIT >= 0).tolist(), free_cameras=[True] * 3, noise_px=0.3)
+    sets, layout = RigidGroups(of_unit=OF_UNIT, count=2), case.problem.layout
+    system = case.problem.normal_equations(case.truth, 0.0)
+    of, maps = sets.unit_from_set_steps(case.truth, layout)
+    whole, split = np.zeros((6 * len(of), 12)), 6 * len(of)
+    for k, (s, m) in enumerate(zip(of, maps, strict=True)):
+        whole[6 * k : 6 * k + 6, 6 * s : 6 * s + 6] = m
+    expected = whole.T @ system.matrix[:split, split:]
+    assert np.abs(expected).max() > 0
+    assert np.allclose(sets.with_cameras(system, case.truth), expected, rtol=1e-9, atol=1e-6)
+
+
 def test_sets_find_back_and_stay_rigid(case: Case) -> None:
     problem = with_sets(case)
     start = moved(problem, case.truth, np.array([0.02, -0.01, 0.04, 0.4, -0.3, 0.2, 0.01, 0.03, -0.02, -0.3, 0.2, 0.1]))
