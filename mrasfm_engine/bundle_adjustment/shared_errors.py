@@ -106,9 +106,10 @@ def _best_sigma_factor(covariance: Floats, of_independent: Floats, of_priors: Fl
     # In axes in which the information of images and of priors is diagonal, and their sum is one.
     values, vectors = np.linalg.eigh(independent)
     white = vectors / np.sqrt(np.maximum(values, SINGULAR))
-    share, axes = np.linalg.eigh(white.T @ priors @ white)
-    share, white = np.clip(share, 0.0, 1.0), white @ axes
-    scores = white.T @ found @ white - np.diag(share)  # covariance of those of images
+    of_terms, axes = np.linalg.eigh(white.T @ priors @ white)
+    white = white @ axes
+    scores = white.T @ found @ white - np.diag(of_terms)  # covariance of those of images
+    share = np.clip(of_terms, 0.0, 1.0)  # above one where the loss bends the other way: images tell nothing there
     told = (1.0 - share)[:, None] * np.linalg.pinv(scores, rcond=SINGULAR, hermitian=True) * (1.0 - share)
     metric = told + np.diag(share)
 

@@ -130,6 +130,15 @@ def test_independent_errors_keep_their_weight() -> None:
     assert 1.0 <= covariances(problem, solve(problem)[0]).sigma_factor < 1.05
 
 
+def test_information_that_the_loss_takes_from_priors_is_no_error_of_images() -> None:
+    """Where large residuals bend a robust loss the other way, priors know more than the sum, and images err no more."""
+    of_priors = np.diag([1.5, 0.3])
+    covariance = of_priors + np.diag([0.9, 0.7])
+    assert shared_errors._best_sigma_factor(covariance, np.eye(2), of_priors) == 1.0
+    more = of_priors + np.diag([0.9, 7.0])
+    assert 2.0 < shared_errors._best_sigma_factor(more, np.eye(2), of_priors) < 4.0
+
+
 def drawn_prior(truth: State, seed: int) -> CalibrationPrior:
     """A prior that is off by what it states."""
     off = np.random.default_rng(100 + seed).normal(size=(CAMERAS, 6))
