@@ -18,6 +18,15 @@ _TRUTH = frozenset(
     }
 )  # files and folders beside the manifest of a drive that was imported or rendered
 
+_LEFT_BY_SYSTEMS = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
+_FOLDER_OF_MACOS = "__MACOSX"
+
+
+def is_ignored(path: str) -> bool:
+    """Return whether an operating system or its file manager put the file there, and nobody misses it."""
+    parts = path.split("/")
+    return _FOLDER_OF_MACOS in parts or parts[-1] in _LEFT_BY_SYSTEMS or parts[-1].startswith("._")
+
 
 def is_truth(path: str) -> bool:
     """Return whether a path in a drive's folder is one of the true values that imports and renderings write there."""

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from mrasfm_engine.errors import InputError, StorageError, storage_error
 from schemas.artifacts import CHECKPOINT_FOLDER, REPORT_FILE
-from schemas.file_names import MANIFEST_NAME
+from schemas.file_names import MANIFEST_NAME, is_ignored
 
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
@@ -70,7 +70,7 @@ def require_free(out: Path, *, result: str) -> None:
     """Refuse a file, a drive, and a folder with files in which no result was made before.
 
     A folder with a result, or with finished stages of a run that was interrupted, is that result's, whatever else lies
-    in it. Hidden files alone, as those that a file manager leaves, make no folder somebody's.
+    in it. Hidden files alone, and those that a file manager leaves, make no folder somebody's.
 
     Parameters
     ----------
@@ -94,7 +94,8 @@ def require_free(out: Path, *, result: str) -> None:
         )
     if _holds_result(out) or (out / CHECKPOINT_FOLDER).is_dir():
         return
-    foreign = min((path for path in out.glob("*") if not path.name.startswith(".")), default=None)
+    shown = (path for path in out.glob("*") if not path.name.startswith("."))
+    foreign = min((path for path in shown if not is_ignored(path.name)), default=None)
     if foreign is not None:
         raise InputError(
             f"{foreign} was made by no {result}, and the files of a {result} would lie among what is in {out}",

@@ -13,7 +13,7 @@ from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
 from mrasfm_engine.preflight.drive_check import check_drive, require_sound
 from mrasfm_engine.scene.drive import Drive
 from schemas import DriveManifest, parse_manifest, parse_new_manifest
-from schemas.file_names import MANIFEST_NAME, is_truth
+from schemas.file_names import MANIFEST_NAME, is_ignored, is_truth
 from schemas.findings import Finding, Severity
 
 __all__ = [
@@ -63,7 +63,8 @@ def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
 def foreign_file(folder: Path) -> Path | None:
     """The first file or folder in a drive's folder that no import and no rendering makes; None where there is none."""
     made = (MANIFEST_NAME, "images", "masks")
-    return min((path for path in folder.iterdir() if path.name not in made and not is_truth(path.name)), default=None)
+    others = (path for path in folder.iterdir() if not is_truth(path.name) and not is_ignored(path.name))
+    return min((path for path in others if path.name not in made), default=None)
 
 
 def read_manifest(path: Path, *, is_new: bool) -> DriveManifest:

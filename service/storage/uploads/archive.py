@@ -6,12 +6,12 @@ from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
 from typing import BinaryIO
 
-from schemas.file_names import MANIFEST_NAME
+from schemas.file_names import MANIFEST_NAME, is_ignored
 from service.errors import ArchiveTooLarge, OtherManifest
 from service.storage.spool import Spooled, SpoolWriter
 from service.storage.uploads.archive_errors import shown
 from service.storage.uploads.archive_limits import ArchiveLimits, quota_too_small
-from service.storage.uploads.archive_names import EntryNames, is_ignored, may_be_manifest
+from service.storage.uploads.archive_names import EntryNames, may_be_manifest
 from service.storage.uploads.decompress import compression_of
 from service.storage.uploads.images import check_image
 from service.storage.uploads.tar_reader import read_tar

@@ -12,8 +12,6 @@ from service.storage.uploads.archive_errors import shown
 _MAX_NAME_BYTES = 1024  # the manifest's paths have up to 512 characters, and a top folder may come before them
 _SHOWN_NAMES = 5
 _DRIVE_LETTER = re.compile(r"[A-Za-z]:")
-_IGNORED_FILES = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
-_IGNORED_FOLDER = "__MACOSX"
 
 
 def safe_name(raw: bytes, *, is_folder: bool = False) -> str:
@@ -45,12 +43,6 @@ def safe_name(raw: bytes, *, is_folder: bool = False) -> str:
     if (name or not is_folder) and not all(part not in ("", ".") for part in parts):
         raise _unsafe(raw, "has an empty part or '.' in its path", "Make the archive again with plain relative names.")
     return name
-
-
-def is_ignored(name: str) -> bool:
-    """Return whether an operating system put the file there, and nobody misses it."""
-    parts = name.split("/")
-    return _IGNORED_FOLDER in parts[:-1] or parts[-1] in _IGNORED_FILES or parts[-1].startswith("._")
 
 
 class EntryNames:

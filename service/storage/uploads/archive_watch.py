@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeAlias
 
-from schemas.file_names import is_truth
+from schemas.file_names import is_ignored, is_truth
 from service.storage.uploads.archive_limits import SMALL_BYTES, require_ratio
-from service.storage.uploads.archive_names import is_ignored, safe_name, unexpected_files, without_top
+from service.storage.uploads.archive_names import safe_name, unexpected_files, without_top
 from service.storage.uploads.decompress import MAX_XZ_MEMORY_BYTES, compression_of
 from service.storage.uploads.tar_reader import MAX_HEADER_BYTES, PAX_SIZE, checked_name, not_an_archive
 from service.storage.uploads.zip_reader import SIGNATURES

@@ -654,7 +654,8 @@ def test_a_folder_with_files_that_no_scene_has_made_is_refused(tmp_path: Path, n
 
 def test_a_folder_of_ours_stays_free(scene: Scene, tmp_path: Path) -> None:
     """An empty one, one that only a file manager has opened, and a scene's, to which notes were added."""
-    (tmp_path / ".DS_Store").touch()
+    for name in (".DS_Store", "Thumbs.db", "desktop.ini"):
+        (tmp_path / name).touch()
     require_free_folder(tmp_path)
     write_scene(scene, tmp_path / "scene", {})
     (tmp_path / "scene" / "notes.txt").touch()

@@ -537,6 +537,15 @@ def test_force_spares_what_lies_in_the_folder_of_a_drive(recording: Path, tmp_pa
     assert (out / "scene").is_dir()
 
 
+@pytest.mark.parametrize("name", [".DS_Store", "Thumbs.db", "desktop.ini", "._drive.json"])
+def test_force_replaces_a_drive_that_a_file_manager_has_shown(recording: Path, tmp_path: Path, name: str) -> None:
+    out = tmp_path / "drive"
+    import_recording(recording, out)
+    (out / name).touch()
+    import_recording(recording, out, force=True)
+    assert not (out / name).exists()
+
+
 def test_empty_folder_may_be_filled(recording: Path, tmp_path: Path) -> None:
     (tmp_path / "a/b/drive").mkdir(parents=True)
     assert import_recording(recording, tmp_path / "a/b/drive").units == 8
