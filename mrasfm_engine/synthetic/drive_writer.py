@@ -34,7 +34,7 @@ from mrasfm_engine.synthetic.streets import GROUND_GRID_M, Ground
 from mrasfm_engine.synthetic.world import StaticWorld, build_world
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Ints
 from schemas import DriveManifest, Frame, FrameImage, LabelMap, Rig, RoughPose, RoughTrajectory
-from schemas.file_names import MANIFEST_NAME, TRUTH_NAME
+from schemas.file_names import MANIFEST_NAME, TRUTH_NAME, is_ignored
 
 FIRST_EPOCH_US = 1_750_000_000_000_000
 _BETWEEN_DRIVES_US = 3_600_000_000
@@ -124,9 +124,9 @@ def _check_target(out: Path, *, force: bool) -> None:
 def _foreign_file(out: Path) -> Path | None:
     """The first file that is of no drive, in the folder of one or of several; None where there is none."""
     drives = [path for path in sorted(out.glob("drive_*")) if (path / MANIFEST_NAME).is_file()]
-    if not drives:
+    if (out / MANIFEST_NAME).is_file():
         return foreign_file(out)
-    others = [path for path in sorted(out.iterdir()) if path not in drives]
+    others = [path for path in sorted(out.iterdir()) if path not in drives and not is_ignored(path.name)]
     return next(filter(None, [*others, *map(foreign_file, drives)]), None)
 
 

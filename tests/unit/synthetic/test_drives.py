@@ -180,6 +180,17 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["drive"]
 
 
+@pytest.mark.parametrize("name", ["images/holiday.jpg", "masks/0.png", "truth.tum"])
+def test_force_spares_a_folder_that_is_no_drive(tmp_path: Path, name: str) -> None:
+    """Its files have names that those of a drive have, too."""
+    own = tmp_path / "own" / name
+    own.parent.mkdir(parents=True)
+    own.touch()
+    with pytest.raises(InputError, match=f"own/{name.partition('/')[0]} is no file of a rendered drive"):
+        render_drives(small_options(**TINY, cameras=1, masks=False), tmp_path / "own", force=True)
+    assert own.is_file()
+
+
 def test_force_spares_what_lies_among_several_drives(tmp_path: Path) -> None:
     out = tmp_path / "drives"
     options = small_options(**TINY, cameras=1, masks=False, drives=2)
