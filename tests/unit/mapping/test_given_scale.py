@@ -13,7 +13,7 @@ from mrasfm_engine.mapping import given_scale, refinement
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapping_report import scale_findings
 from mrasfm_engine.mapping.refinement import refine
-from mrasfm_engine.mapping.refinement_result import Refinement
+from mrasfm_engine.mapping.refinement_result import Refinement, solver_options
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -96,6 +96,26 @@ def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypat
     free = [refined(one)[0] for one in drives]
     assert 1e-4 < rms(both) < min(rms(held), rms(free))
     assert 0.5 < rms((np.array(both) / sigmas).tolist()) < 2.0
+
+
+def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share() -> None:
+    """What lens models leave is the same in image after image; in pixels the robust loss stays as it is."""
+    simulated = drive(1)
+    mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(UNITS))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refinement, "certainty_of", lambda *_: None)
+        unweighed = refined(simulated)[1]
+    assert unweighed.sigma_factor == 1.0
+    result = refine(mapper)
+    assert 1.5 < result.sigma_factor < 4.0
+    assert result.given_scale is not None
+    assert unweighed.given_scale is not None
+    assert result.given_scale.sigma == pytest.approx(unweighed.given_scale.sigma * result.sigma_factor)
+    assert result.given_scale.sigma_scale == pytest.approx(unweighed.given_scale.sigma_scale)
+    options = solver_options(mapper, result)
+    assert options.sigma_px == pytest.approx(result.sigma_px * result.sigma_factor)
+    in_px = mapper.config.bundle_adjustment.loss_scale * result.sigma_px
+    assert options.loss_scale * options.sigma_px == pytest.approx(in_px)
 
 
 def test_rotations_that_images_contradict_say_nothing_of_the_scale() -> None:
