@@ -21,13 +21,14 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.geotags import GeoTag, read_exif, read_geo_txt
 from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, gnss_of_vehicle
 from mrasfm_engine.importers.rig_folder import checked_camera
-from mrasfm_engine.importers.skipped_images import IMAGE_SUFFIXES, notes_of_images_without_a_camera
+from mrasfm_engine.importers.skipped_images import is_image, notes_of_images_without_a_camera
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.io.image_header import read_header
 from mrasfm_engine.types import Floats
 from schemas import BodyAxes, Camera, Gnss
 from schemas.drive import MAX_CAMERAS, MAX_FRAMES, Finite, Vector3
+from schemas.file_names import is_ignored
 
 DESCRIPTION = "rig_config.json (COLMAP)"
 OPTIONS = ("scene", "forward_camera", "rate_hz", "antenna_m", "gnss_sigma_m")
@@ -141,9 +142,9 @@ def _names(rig: _Rig, file: Path) -> list[str]:
 
 
 def _paths(root: Path) -> dict[str, Path]:
-    """All images below a folder by their paths in it."""
-    images = sorted(path for path in root.rglob("*") if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file())
-    return {path.relative_to(root).as_posix(): path for path in images}
+    """All images below a folder by their paths in it, without what macOS leaves beside them."""
+    images = {path.relative_to(root).as_posix(): path for path in sorted(root.rglob("*")) if is_image(path)}
+    return {name: path for name, path in images.items() if not is_ignored(name) and path.is_file()}
 
 
 def _images(

@@ -183,6 +183,17 @@ def test_images_under_no_prefix_are_counted_and_named(rig: Path, tmp_path: Path)
     assert not any("image_prefix" in note for note in summary.notes)
 
 
+def test_what_macos_leaves_beside_images_is_none(rig: Path, tmp_path: Path) -> None:
+    """Unpacked elsewhere, its archives have a second file for every image, of the same suffix."""
+    write_images(rig)
+    for name in ("rig1/front/._image0.jpg", "__MACOSX/rig1/front/image0.jpg", "__MACOSX/rig1/front/._image0.jpg"):
+        (rig / "images" / name).parent.mkdir(parents=True, exist_ok=True)
+        (rig / "images" / name).write_bytes(b"\x00\x05\x16\x07")
+    summary = import_recording(rig, tmp_path / "drive", options={"rate_hz": 10.0})
+    assert (summary.units, summary.images) == (FRAMES, 2 * FRAMES)
+    assert not any("image_prefix" in note for note in summary.notes)
+
+
 def edited(edit: Callable[[list[dict[str, Any]]], Any]) -> str:
     rigs = config()
     edit(rigs)
