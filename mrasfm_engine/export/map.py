@@ -44,7 +44,6 @@ Kept = Mapping[str, tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]]  
 
 
 CALIBRATION_FOLDER = "calibration"
-ALWAYS = ("model", "points.ply", "poses.tum", "poses.json", "frame.json", MAP_FILE)
 REPLACED = (PICTURES_FOLDER, CALIBRATION_FOLDER, SCENES_FOLDER, SEAMS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 

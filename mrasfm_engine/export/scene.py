@@ -57,16 +57,6 @@ from schemas.artifacts import (
 Draw = Callable[[], PictureFiles]
 ROAD_FILE = "road.json"
 MANIFEST_FILE = "manifest.json"
-ALWAYS = (
-    "model",
-    "points.ply",
-    "poses.tum",
-    "poses.json",
-    "calibration.json",
-    "frame.json",
-    "features.db",
-    MANIFEST_FILE,
-)
 REPLACED = (PICTURES_FOLDER, OWN_CAR_FOLDER, ROAD_FILE, COMPONENTS_FOLDER, REPORT_PAGE, *interchange.OPTIONAL)
 
 

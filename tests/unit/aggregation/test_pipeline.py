@@ -12,7 +12,7 @@ from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
-from mrasfm_engine.export.map import ALWAYS, REPLACED
+from mrasfm_engine.export.map import REPLACED
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.pipeline import reconstruct
@@ -59,7 +59,8 @@ def test_a_map_is_replaced_by_the_next_and_no_name_of_it_is_unknown(tmp_path: Pa
     (out / "notes.txt").touch()  # what is no map's stays
     aggregate([tmp_path / "one", tmp_path / "two"], out, CONFIG)
     made = {path.name for path in out.iterdir()} - {".stages", "report.json"}
-    assert {"notes.txt", *ALWAYS} <= made <= {"notes.txt", *REPLACED, *ALWAYS}
+    always = {"notes.txt", "model", "points.ply", "poses.tum", "poses.json", "frame.json", "map.json"}
+    assert always <= made <= always.union(REPLACED)
 
 
 def test_a_map_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
