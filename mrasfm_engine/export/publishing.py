@@ -107,8 +107,8 @@ def require_free(out: Path, *, result: str) -> None:
 def _holds_result(folder: Path) -> bool:
     """Return whether the report in a folder is that of a scene or map, and not another program's."""
     try:
-        return "summary" in dict(json.loads((folder / COMPLETE_MARK).read_bytes()))
-    except (OSError, ValueError, TypeError):
+        return "registered_units" in json.loads((folder / COMPLETE_MARK).read_bytes())["summary"]
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
         return False
 
 

@@ -652,6 +652,13 @@ def test_a_folder_with_files_that_no_scene_has_made_is_refused(tmp_path: Path, n
     require_free_folder(tmp_path)  # of a run that was interrupted
 
 
+@pytest.mark.parametrize("report", ['{"summary": {"passed": 3}, "tests": []}', '{"summary": 3}', "[[]]", "[" * 100_000])
+def test_a_report_of_another_program_is_spared(tmp_path: Path, report: str) -> None:
+    (tmp_path / "report.json").write_text(report)
+    with pytest.raises(InputError, match=r"report\.json was made by no scene"):
+        require_free_folder(tmp_path)
+
+
 def test_a_folder_of_ours_stays_free(scene: Scene, tmp_path: Path) -> None:
     """An empty one, one that only a file manager has opened, and a scene's, to which notes were added."""
     for name in (".DS_Store", "Thumbs.db", "desktop.ini"):
