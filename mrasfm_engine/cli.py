@@ -11,6 +11,7 @@ import atexit
 import gc
 import json
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
@@ -75,6 +76,11 @@ def overview() -> str:
     return "\n".join(lines) + "\n"
 
 
+def _without_control(text: str) -> str:
+    """Lines whose other control characters are escaped: a message may name any file, and terminals obey them."""
+    return re.sub(r"[^\t\n\x20-\x7e\xa0-\U0010ffff]", lambda found: ascii(found[0])[1:-1], text)
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one subcommand."""
     words = sys.argv[1:] if argv is None else argv
@@ -99,7 +105,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"mrasfm: {error}", file=sys.stderr)
         return EXIT_INTERRUPTED
     except MrasfmError as error:
-        print(f"mrasfm: error: {error}", file=sys.stderr)
+        print(f"mrasfm: error: {_without_control(str(error))}", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print("mrasfm: interrupted", file=sys.stderr)

@@ -131,6 +131,14 @@ def test_an_empty_folder_is_refused_before_anything_is_read(capsys: pytest.Captu
 
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="there is no bash")
+def test_a_file_whose_name_a_terminal_would_obey_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "\x1b[2Jü\x9b.txt").touch()
+    assert main(["reconstruct", str(tmp_path / "drive"), "--out", str(tmp_path)]) == cli.EXIT_BAD_INPUT
+    said = capsys.readouterr().err
+    assert r"\x1b[2Jü\x9b.txt was made by no scene" in said
+    assert said.replace("\n", "").isprintable()
+
+
 def test_bash_completes_commands_and_options() -> None:
     script = FOLDER / "mrasfm.bash"
 
