@@ -13,8 +13,8 @@ from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, StorageError
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.export.publishing import scratch_folder
-from mrasfm_engine.export.scene import require_free_folder, write_scene
+from mrasfm_engine.export.publishing import require_free, scratch_folder
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
@@ -68,7 +68,7 @@ def reconstruct(
             remedy="Give the scene a folder of its own with --out.",
             code="not-a-scene",
         )
-    require_free_folder(out)
+    require_free(out, result="scene")
     drive = read_drive(drive_folder, is_new=is_new)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
     run.report["drive"] = drive.manifest.name

@@ -24,8 +24,8 @@ from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.aggregation.vehicles import Vehicle, vehicles_of
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
-from mrasfm_engine.export.map import require_free_folder, write_map
-from mrasfm_engine.export.publishing import COMPLETE_MARK
+from mrasfm_engine.export.map import write_map
+from mrasfm_engine.export.publishing import COMPLETE_MARK, require_free
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.types import Floats, StageProgress
@@ -89,7 +89,7 @@ def aggregate(
             remedy="Give the map a folder of its own with --out.",
             code="not-a-map",
         )
-    require_free_folder(out)
+    require_free(out, result="map")
     named = name_scenes(scenes)
     run = stages.Run(config, StageStore(out / CHECKPOINT_FOLDER), into, progress, cancel)
     run.report["settings"] = config.model_dump(mode="json")

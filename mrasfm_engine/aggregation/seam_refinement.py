@@ -210,11 +210,9 @@ def adjust_transform(
     assert sets is not None
     sigma2 = max(0.25, float(np.median(errors_px**2)) / (2 * np.log(2)) if len(errors_px) else 1.0)
     problem = replace(problem, observations=thinned(problem.observations, problem.layout.unit_slot >= 0))
-    covariance = sets.covariances(problem.normal_equations(solution, 0.0), solution)[0] * sigma2 * CORRELATION
-    covariance = covariance + _by_calibrations(problem, solution, sets, _sigmas_of_cameras(assembly))
     return RefinedSeam(
         a_from_b=se3.inverse(poses[0]) @ poses[1],
-        covariance=covariance,
+        covariance=_covariance(problem, solution, sets, _sigmas_of_cameras(assembly), sigma2 * CORRELATION),
         shared=shared,
         errors_px=errors_px,
         report=report,
@@ -230,8 +228,8 @@ def _sigmas_of_cameras(assembly: Assembly) -> Floats:
     return np.concatenate(parts)
 
 
-def _by_calibrations(problem: Problem, state: State, sets: RigidGroups, sigma: Floats) -> Floats:
-    """Covariance (6, 6) of the set's step by errors of the cameras, of standard deviations sigma (c, 6).
+def _covariance(problem: Problem, state: State, sets: RigidGroups, sigma: Floats, variance: float) -> Floats:
+    """Covariance (6, 6) of the set's step: by errors of observations of a variance, and of cameras of sigma (c, 6).
 
     A camera that looks elsewhere than its scene thinks has its points where the other scene does not: it turns and
     shifts the seam, and no residual shows it [a consider covariance: Bierman, Factorization Methods for Discrete
@@ -239,12 +237,12 @@ def _by_calibrations(problem: Problem, state: State, sets: RigidGroups, sigma: F
     """
     layout = Layout.from_free(problem.layout.unit_slot >= 0, np.ones(len(sigma), dtype=np.bool_))
     system = replace(problem, layout=layout).normal_equations(state, 0.0)
+    inverse: Floats = sets.covariances(system, state)[0]
+    if not np.isfinite(inverse).all():
+        return inverse
     by_error = sets.with_cameras(system, state).reshape(-1, len(sigma), layout.camera_dof)[:, :, :6] * sigma
-    try:
-        moved = np.linalg.solve(sets.condense(system, state)[0], by_error.reshape(len(by_error), -1))
-    except np.linalg.LinAlgError:
-        return np.full((len(by_error), len(by_error)), np.inf)
-    result: Floats = moved @ moved.T
+    moved = inverse @ by_error.reshape(len(by_error), -1)
+    result: Floats = variance * inverse + moved @ moved.T
     return result
 
 

@@ -22,7 +22,7 @@ from mrasfm_engine.export.check import Check, ReadBack, common_checks, completin
 from mrasfm_engine.export.comparisons import Row, Rows
 from mrasfm_engine.export.file_contents import sha256, write_content
 from mrasfm_engine.export.interchange import Interchange
-from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free
+from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing
 from mrasfm_engine.export.report_page import map_page, write_page
 from mrasfm_engine.export.scene import check_scene, write_common, write_json
 from mrasfm_engine.io.stage_store import StageStore
@@ -79,11 +79,6 @@ def write_map(content: MapContent, out: Path, report: Mapping[str, Any]) -> dict
     needed += 60 * sum(len(f.xy_px) for f in content.scene.features) + picture_files.size_bytes(content.pictures)
     with publishing(out, needed, replaced=REPLACED) as work:
         return _write(content, work, report)
-
-
-def require_free_folder(out: Path) -> None:
-    """Refuse a folder with files in which no map was made before, see `publishing.require_free`."""
-    require_free(out, result="map")
 
 
 def _write(content: MapContent, work: Path, report: Mapping[str, Any]) -> dict[str, Any]:

@@ -39,7 +39,7 @@ from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, com
 from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_free, require_space
+from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_space
 from mrasfm_engine.export.report_page import scene_page, write_page
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.io.plain_json import plain
@@ -114,11 +114,6 @@ def write_scene(
             folder = work / component_folder(number)
             folder.mkdir(parents=True)
             _write(other, folder, own_report)
-
-
-def require_free_folder(out: Path) -> None:
-    """Refuse a folder with files in which no scene was made before, see `publishing.require_free`."""
-    require_free(out, result="scene")
 
 
 def component_list(scenes: Sequence[Scene]) -> list[dict[str, Any]]:

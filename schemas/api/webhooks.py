@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, StringConstraints
 from pydantic.config import JsonDict
 
 from schemas.api.resource import EXAMPLE_JOB, RequestBody, Resource
+from schemas.drive import PRINTED_NAME
 from schemas.patterns import Pattern
 
 MAX_URL_CHARACTERS = 2000
@@ -54,7 +55,7 @@ class WebhookRequest(RequestBody):
     description: Annotated[
         str,
         StringConstraints(max_length=200),
-        Pattern(r"^[^\x00-\x1f\x7f-\x9f]*$", words="characters that can be printed, without control characters"),
+        Pattern(r"^[^\x00-\x1f\x7f-\x9f]*$", words=PRINTED_NAME.words),
     ] = Field("", description="for people")
 
 

@@ -33,6 +33,14 @@ def moved(problem: Problem, state: State, step: np.ndarray) -> State:
     return problem.retract(state, by_unit.ravel(), state.points_m)
 
 
+def whole_map(of: np.ndarray, maps: np.ndarray) -> np.ndarray:
+    """The map (6 units, 12) from the steps of both sets to those of their units."""
+    whole = np.zeros((6 * len(of), 12))
+    for k, (s, m) in enumerate(zip(of, maps, strict=True)):
+        whole[6 * k : 6 * k + 6, 6 * s : 6 * s + 6] = m
+    return whole
+
+
 def test_gradient_is_that_of_the_cost(case: Case) -> None:
     # Fixed points add nothing to the reduced gradient, so that it can be compared with the cost's own differences.
     observations = case.problem.observations
@@ -54,9 +62,7 @@ def test_condensed_matrix_is_the_units_matrix_between_the_maps(case: Case) -> No
     system = problem.normal_equations(case.truth, 0.0)
     assert problem.sets is not None
     of, maps = problem.sets.unit_from_set_steps(case.truth, problem.layout)
-    whole = np.zeros((6 * len(of), 12))
-    for k, (s, m) in enumerate(zip(of, maps, strict=True)):
-        whole[6 * k : 6 * k + 6, 6 * s : 6 * s + 6] = m
+    whole = whole_map(of, maps)
     matrix, _, _ = problem.sets.condense(system, case.truth)
     assert np.allclose(matrix, whole.T @ system.matrix @ whole, rtol=1e-9, atol=1e-6)
 
@@ -66,10 +72,8 @@ def test_the_block_with_cameras_is_the_units_between_the_maps() -> None:
     sets, layout = RigidGroups(of_unit=OF_UNIT, count=2), case.problem.layout
     system = case.problem.normal_equations(case.truth, 0.0)
     of, maps = sets.unit_from_set_steps(case.truth, layout)
-    whole, split = np.zeros((6 * len(of), 12)), 6 * len(of)
-    for k, (s, m) in enumerate(zip(of, maps, strict=True)):
-        whole[6 * k : 6 * k + 6, 6 * s : 6 * s + 6] = m
-    expected = whole.T @ system.matrix[:split, split:]
+    whole = whole_map(of, maps)
+    expected = whole.T @ system.matrix[: len(whole), len(whole) :]
     assert np.abs(expected).max() > 0
     assert np.allclose(sets.with_cameras(system, case.truth), expected, rtol=1e-9, atol=1e-6)
 

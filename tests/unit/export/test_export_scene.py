@@ -23,7 +23,8 @@ from mrasfm_engine.export.calibration import calibration_document, document_in_m
 from mrasfm_engine.export.colmap import approximations, colmap_models
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.pose_files import poses_document
-from mrasfm_engine.export.scene import require_free_folder, write_scene
+from mrasfm_engine.export.publishing import require_free
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
@@ -634,7 +635,7 @@ def test_the_folder_of_a_drive_is_no_folder_for_a_scene(tmp_path: Path) -> None:
             reconstruct(tmp_path, tmp_path, EngineConfig())
         assert found.value.code == "bad-out-folder"
         (tmp_path / "report.json").touch()
-    require_free_folder(tmp_path / "scene")
+    require_free(tmp_path / "scene", result="scene")
 
 
 @pytest.mark.parametrize("name", ["pictures/mine.jpg", "notes.txt", "report.json"])
@@ -647,23 +648,23 @@ def test_a_folder_with_files_that_no_scene_has_made_is_refused(tmp_path: Path, n
         reconstruct(tmp_path / "no drive", tmp_path, EngineConfig())
     assert found.value.code == "bad-out-folder"
     assert found.value.remedy == "Give the scene a new or empty folder with --out."
-    require_free_folder(tmp_path / "new")
+    require_free(tmp_path / "new", result="scene")
     (tmp_path / ".stages").mkdir()
-    require_free_folder(tmp_path)  # of a run that was interrupted
+    require_free(tmp_path, result="scene")  # of a run that was interrupted
 
 
 @pytest.mark.parametrize("report", ['{"summary": {"passed": 3}, "tests": []}', '{"summary": 3}', "[[]]", "[" * 100_000])
 def test_a_report_of_another_program_is_spared(tmp_path: Path, report: str) -> None:
     (tmp_path / "report.json").write_text(report)
     with pytest.raises(InputError, match=r"report\.json was made by no scene"):
-        require_free_folder(tmp_path)
+        require_free(tmp_path, result="scene")
 
 
 def test_a_folder_of_ours_stays_free(scene: Scene, tmp_path: Path) -> None:
     """An empty one, one that only a file manager has opened, and a scene's, to which notes were added."""
     for name in (".DS_Store", "Thumbs.db", "desktop.ini"):
         (tmp_path / name).touch()
-    require_free_folder(tmp_path)
+    require_free(tmp_path, result="scene")
     write_scene(scene, tmp_path / "scene", {})
     (tmp_path / "scene" / "notes.txt").touch()
-    require_free_folder(tmp_path / "scene")
+    require_free(tmp_path / "scene", result="scene")
