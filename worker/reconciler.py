@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from sqlalchemy import ColumnElement, delete, or_, select, tuple_
@@ -36,6 +37,7 @@ log = logging.getLogger("mrasfm.reconciler")
 
 _HOUR_US = 3600 * 1_000_000
 _SWEEP_EVERY_S = 600.0
+_SWEEP_RESTS = 9.0  # times as long as it took: of millions of files it takes minutes of the database
 _ORPHANS_FIRST_S = 300.0
 _ORPHANS_CHECK_EVERY_S = 600.0
 _ORPHANS_EVERY_US = 24 * _HOUR_US  # not with every restart: listing a store costs time and, in the cloud, money
@@ -69,7 +71,7 @@ class Reconciler:
         threads = [
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
-                ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0),
+                ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0, _SWEEP_RESTS),
                 ("webhooks", lambda: self._webhooks.send_due(ended), self._settings.webhook_seconds, 0.0),
                 ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
@@ -81,12 +83,19 @@ class Reconciler:
             thread.join(_END_WITHIN_S)  # what is cut short is done by the next one
 
     def _repeat(
-        self, ended: threading.Event, what: str, step: Callable[[], object], every_s: float, first_s: float
+        self,
+        ended: threading.Event,
+        what: str,
+        step: Callable[[], object],
+        every_s: float,
+        first_s: float,
+        rests: float = 0.0,
     ) -> None:
         ended.wait(first_s)
         while not ended.is_set():
+            begun_s = time.monotonic()
             self._try(what, step)
-            ended.wait(every_s)
+            ended.wait(max(every_s, rests * (time.monotonic() - begun_s)))
 
     def _try(self, what: str, step: Callable[[], object]) -> None:
         try:

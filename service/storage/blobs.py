@@ -9,10 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import ColumnElement, bindparam, delete, select, update
+from sqlalchemy import ColumnElement, bindparam, delete, func, select, update
 from sqlalchemy import exists as sql_exists
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, aliased
 
 from service.database.tables import (
     Blob,
@@ -37,6 +37,14 @@ class Recorded:
     id: str
     key: str
     size_bytes: int
+
+
+@dataclass(frozen=True)
+class UnusedPage:
+    """The unused among some blobs, by id, and the last content that was looked at; None after the last page."""
+
+    blob_ids: list[str]
+    last_sha256: str | None
 
 
 # A blob's object, or a copy of it that was begun.
@@ -72,9 +80,9 @@ def exists(session: Session, project_id: str, sha256: str) -> bool:
     return session.scalar(found) is not None
 
 
-def is_drive_file() -> ColumnElement[bool]:
+def is_drive_file(blob: type[Blob] = Blob) -> ColumnElement[bool]:
     """The condition that a drive has a blob as a file. What else a project stores was not checked to be an image."""
-    return sql_exists().where(DriveFile.blob_id == Blob.id)
+    return sql_exists().where(DriveFile.blob_id == blob.id)
 
 
 def lock_project(session: Session, project_id: str) -> None:
@@ -224,31 +232,41 @@ def quota_full(project: Project, size_bytes: int, *, coming_bytes: int = 0) -> S
     )
 
 
-def unused() -> ColumnElement[bool]:
+def unused(blob: type[Blob] = Blob) -> ColumnElement[bool]:
     """The condition that nothing refers to a blob."""
     return ~(
-        sql_exists().where(Drive.manifest_blob_id == Blob.id)
-        | is_drive_file()
-        | sql_exists().where(SceneFile.blob_id == Blob.id)
-        | sql_exists().where(Checkpoint.blob_id == Blob.id)
-        | sql_exists().where(MapFile.blob_id == Blob.id)
-        | sql_exists().where(MapCheckpoint.blob_id == Blob.id)
-        | sql_exists().where(ExportFile.blob_id == Blob.id)
+        sql_exists().where(Drive.manifest_blob_id == blob.id)
+        | is_drive_file(blob)
+        | sql_exists().where(SceneFile.blob_id == blob.id)
+        | sql_exists().where(Checkpoint.blob_id == blob.id)
+        | sql_exists().where(MapFile.blob_id == blob.id)
+        | sql_exists().where(MapCheckpoint.blob_id == blob.id)
+        | sql_exists().where(ExportFile.blob_id == blob.id)
     )
 
 
 def find_unused(
-    session: Session, project_id: str, *, untouched_since_us: int, after_sha256: str = "", limit: int
-) -> list[Blob]:
-    """A project's blobs that nothing refers to, in the order of their contents; what `forget_unused` may be given.
+    session: Session, project_id: str, *, untouched_since_us: int, after_sha256: str = "", look_at: int
+) -> UnusedPage:
+    """Some of a project's blobs in the order of their contents, as far as nothing refers to them.
 
     Parameters
     ----------
     after_sha256
         The last content of the page before.
+    look_at
+        How many blobs are looked at. Of a project of millions a statement without this bound would read all, to find
+        the few that are unused, and run out of its time.
+
+    Returns
+    -------
+    UnusedPage
+        With what `forget_unused` may be given.
     """
-    page = select(Blob).where(Blob.project_id == project_id, Blob.sha256 > after_sha256, _ripe(untouched_since_us))
-    return list(session.scalars(page.order_by(Blob.sha256).limit(limit)))
+    of_project = select(Blob).where(Blob.project_id == project_id, Blob.sha256 > after_sha256)
+    page = aliased(Blob, of_project.order_by(Blob.sha256).limit(look_at).subquery())
+    last = session.scalar(select(func.max(page.sha256)))
+    return UnusedPage(list(session.scalars(select(page.id).where(_ripe(untouched_since_us, page)))), last)
 
 
 def unused_among(session: Session, blob_ids: Sequence[str], *, untouched_since_us: int) -> list[str]:
@@ -290,8 +308,8 @@ def _forget(session: Session, condition: ColumnElement[bool]) -> list[str]:
     return [row.key for row in rows]
 
 
-def _ripe(untouched_since_us: int) -> ColumnElement[bool]:
-    return unused() & (Blob.touched_us < untouched_since_us)
+def _ripe(untouched_since_us: int, blob: type[Blob] = Blob) -> ColumnElement[bool]:
+    return unused(blob) & (blob.touched_us < untouched_since_us)
 
 
 def lose(session: Session, blob_id: str) -> None:

@@ -6,10 +6,11 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import select, update
+from sqlalchemy import insert, select, update
 
 from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, DriveFile, Job, Project, Scene, SceneFile, now_us
@@ -17,6 +18,9 @@ from service.domain.keys import create_project
 from service.errors import ServiceError
 from service.settings import Settings
 from service.storage import blobs
+from tests.helpers.live_api import settings_of
+from tests.helpers.migrated import migrated
+from tests.helpers.sqlite_steps import sqlite_steps
 
 EVER_US = 2**62
 
@@ -238,16 +242,39 @@ def test_only_the_blobs_that_are_named_are_forgotten(database: Database, project
 def test_unused_blobs_are_found_page_by_page(database: Database, project_id: str) -> None:
     for name in "edcba":
         record(database, project_id, name)
+    with database.read() as session:
+        name_of = {blob.id: blob.sha256[0] for blob in session.scalars(select(Blob))}
     pages: list[str] = []
-    last = ""
-    while True:
+    last: str | None = ""
+    while last is not None:
         with database.read() as session:
-            page = blobs.find_unused(session, project_id, untouched_since_us=EVER_US, after_sha256=last, limit=2)
-        if not page:
-            break
-        last = page[-1].sha256
-        pages.append("".join(blob.sha256[0] for blob in page))
-    assert pages == ["ab", "cd", "e"]
+            page = blobs.find_unused(session, project_id, untouched_since_us=EVER_US, after_sha256=last, look_at=2)
+        last = page.last_sha256
+        pages.append("".join(sorted(name_of[blob_id] for blob_id in page.blob_ids)))
+    assert pages == ["ab", "cd", "e", ""]
+
+
+def test_a_page_reads_no_more_blobs_than_it_may(tmp_path: Path) -> None:
+    """Where one in a million is unused, a statement that went on until it had its fill would read all of them."""
+    settings = settings_of(tmp_path)
+    migrated(settings)
+    database = Database.from_settings(settings)
+    with database.write() as session:
+        project_id = create_project(session, "test", settings).id
+        blob = {"project_id": project_id, "size_bytes": 0, "touched_us": 0}
+        session.execute(insert(Blob), [{**blob, "sha256": f"{i:064}", "key": f"{i}"} for i in range(4000)])
+        drive = {"project_id": project_id, "name": "d", "cameras": 1, "frames": 1, "files_expected": 1, "has_gnss": 0}
+        of_blobs = session.scalars(select(Blob.id)).all()
+        session.execute(insert(Drive), [{**drive, "manifest_blob_id": blob_id} for blob_id in of_blobs])
+
+    def steps_of_page(look_at: int) -> int:
+        with sqlite_steps(database) as steps, database.read() as session:
+            page = blobs.find_unused(session, project_id, untouched_since_us=EVER_US, look_at=look_at)
+        assert page == blobs.UnusedPage([], f"{look_at - 1:064}")
+        return steps.count
+
+    assert 0 < steps_of_page(40) < steps_of_page(4000) / 20
+    database.close()
 
 
 @pytest.mark.parametrize(
