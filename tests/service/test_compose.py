@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE
+from service.database.connections import Database
 from service.settings import Settings
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -69,3 +70,23 @@ def test_one_service_alone_builds_the_image() -> None:
     assert "\n    build: ." in service_of(
         "migrate"
     )  # all others wait for it, so that it is part of whatever is started
+
+
+def test_the_log_of_no_container_grows_without_bound() -> None:
+    hardened = COMPOSE.partition("x-hardened:")[2].partition("\n\n")[0]
+    assert "logging: { driver: local" in hardened
+    services = re.findall(r"^  (\w+):\n +<<: \*(\w+)$", COMPOSE.partition("\nservices:")[2], re.MULTILINE)
+    assert {base for _, base in services} == {"hardened", "mrasfm", "background"}
+    begun = COMPOSE.partition("\nservices:")[2].partition("\nnetworks:")[0]
+    assert len(services) == len(re.findall(r"^  \w+:$", begun, re.MULTILINE))
+
+
+def test_the_database_takes_more_connections_than_the_api_opens() -> None:
+    """Where it does not, neither workers nor the operator's commands get one while the API waits for a lock."""
+    given = re.search(r"max_connections=(\d+)", service_of("postgres"))
+    database = Database("postgresql+psycopg://nobody@127.0.0.1/none")  # connects to nothing before it is used
+    of_process = database.engine.pool.size() + database.engine.pool._max_overflow  # type: ignore[attr-defined]
+    database.close()
+    assert of_process == 40, "docs/service/deployment.md says so"
+    assert given is not None
+    assert int(given[1]) >= 2 * of_process + 100
