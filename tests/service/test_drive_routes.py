@@ -11,12 +11,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from sqlalchemy import insert
 
+from schemas.api.jobs import JobKind
 from schemas.api.resource import Finding
 from service.api.manifests import manifest_check
-from service.database.tables import Blob, Drive
-from service.domain import drives, jobs
+from service.database.tables import Blob, Drive, Job, JobMember, new_id
+from service.domain import drives, jobs, maps
 from tests.helpers.live_api import Api, Client, problem_of, wait_until
+from tests.helpers.sqlite_steps import sqlite_steps
 from tests.helpers.tiny_drive import TinyDrive, manifest, tiny_drive
 from tests.service.conftest import StartApi
 
@@ -126,6 +129,23 @@ def test_a_drive_that_a_job_needs_is_not_deleted(client: Client) -> None:
     assert job["id"] in problem["detail"]
     client.post(f"/v1/jobs/{job['id']}:cancel")
     assert client.delete(f"/v1/drives/{drive_id}").status_code == 204
+
+
+def test_a_deletion_does_not_read_the_members_of_old_aggregations(api: Api, client: Client) -> None:
+    drive_id = client.create()
+
+    def steps_of_check() -> int:
+        with sqlite_steps(api.database) as steps, api.database.write() as session:
+            maps.require_unused(session, what="it", drive_id=drive_id)
+        return steps.count
+
+    before = steps_of_check()
+    with api.database.write() as session:
+        old = {"project_id": client.project_id, "kind": JobKind.AGGREGATION, "state": "SUCCEEDED", "settings": {}}
+        session.execute(insert(Job), [{**old, "id": "job_old"}])
+        members = [{"job_id": "job_old", "drive_id": new_id("drv"), "name": str(i)} for i in range(2000)]
+        session.execute(insert(JobMember), members)
+    assert steps_of_check() < before + 1000, "a member that is read takes several"
 
 
 def test_deleting_a_drive_cancels_its_check(client: Client) -> None:

@@ -15,14 +15,16 @@ from typing import Any
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import event, text
+from sqlalchemy import event, insert, text
 
+from schemas.api.jobs import JobKind
 from service.api.routes import drives as drive_routes
-from service.database.tables import WorkerSeen
+from service.database.tables import Job, WorkerSeen, new_id
 from service.domain import workers
 from service.logs import JsonFormatter, log_fields
 from service.settings import Settings
 from tests.helpers.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
+from tests.helpers.sqlite_steps import sqlite_steps
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
 
@@ -133,6 +135,22 @@ def test_metrics_count(api: Api, client: Client) -> None:
     assert rise("mrasfm_received_bytes_total{}") > 1000
     assert rise("mrasfm_stored_bytes{}") > 1000
     assert job["id"] not in str(after), "ids are no labels"
+
+
+def test_the_status_is_told_without_the_history_of_jobs(api: Api) -> None:
+    client = api.client()
+    database = api.context.database
+
+    def steps_of_status() -> int:
+        with sqlite_steps(database) as steps:
+            assert client.get("/v1/status").status_code == 200
+        return steps.count
+
+    before = steps_of_status()
+    with api.database.write() as session:
+        old = {"project_id": client.project_id, "kind": JobKind.RECONSTRUCTION, "state": "SUCCEEDED", "settings": {}}
+        session.execute(insert(Job), [{**old, "id": new_id("job")} for _ in range(2000)])
+    assert 0 < steps_of_status() < before + 1000, "a job that is counted takes several"
 
 
 def test_the_status_says_what_is_missing_and_what_that_means(api: Api, client: Client) -> None:

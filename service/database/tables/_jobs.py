@@ -115,7 +115,7 @@ class JobMember(Base):
     __tablename__ = "job_members"
 
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
-    drive_id: Mapped[str] = mapped_column(Id, primary_key=True)
+    drive_id: Mapped[str] = mapped_column(Id, primary_key=True, index=True)
     name: Mapped[str] = mapped_column(String(100))  # of the scene in the map
     child_id: Mapped[str | None] = mapped_column(Id, index=True)
     scene_id: Mapped[str | None] = mapped_column(Id, index=True)
