@@ -294,22 +294,27 @@ class _Execution:
 
     def _publish(self, done: Succeeded) -> None:
         found = sorted(_artifacts(done.out).items())
-        files = {}
+        files: dict[str, StoredFile] = {}
+        # Each content once: masks are often alike, and an object whose blob is another's is nobody's.
+        stored: dict[str, StoredFile] = {}
         for i, (name, path) in enumerate(found):
-            files[name] = self._store(path)
+            sha256 = file_sha256(path)
+            if sha256 not in stored:
+                stored[sha256] = self._store(path, sha256)
+            files[name] = stored[sha256]
             self._meter.update(Stage.PUBLISH, i + 1, len(found))
         self._check_stop()
         made = self._commit(lambda session: self._handler.publish(session, done, files, self._settings))
         log.info("published", extra={"fields": made or {}})
 
-    def _store(self, path: Path) -> StoredFile:
+    def _store(self, path: Path, sha256: str) -> StoredFile:
         store = partial(
             store_file,
             self._database,
             self._artifacts,
             project_id=self._held.project_id,
             path=path,
-            sha256=file_sha256(path),
+            sha256=sha256,
             size_bytes=path.stat().st_size,
         )
         return self._retry(lambda: watched(store, self._check_stop))

@@ -16,7 +16,9 @@ from service.domain import exports, jobs, scenes
 from service.errors import DriveDeleted, ExportDeleted
 from tests.helpers.export_images import USUAL, written
 from tests.helpers.service_world import World, wait_until
+from worker import job_execution
 from worker.job_execution import Runner
+from worker.outcomes import Succeeded
 
 SUMMARY = SceneSummary(
     registered_units=4, units=5, registered_images=7, images=10, points=50, georeferenced=True, warnings=0,
@@ -116,6 +118,29 @@ def test_an_export_with_images_is_made_of_the_drives_files(world: World, scene_i
     # The same again is there; other options are another export.
     assert ask(world, scene_id, "kitti", "colmap", image_size_px=320) == (export_id, None)
     assert ask(world, scene_id, "colmap", image_size_px=320)[1] is not None
+
+
+def test_files_that_are_alike_are_one_object(world: World, scene_id: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Masks are often alike. An object for each would have no record, and lie in the store for a day."""
+
+    def made(*_: object, scratch: Path, **__: object) -> Succeeded:
+        out = scratch / "made"
+        out.mkdir()
+        for name, content in (("a.png", b"mask"), ("b.png", b"mask"), ("c.png", b"another")):
+            (out / name).write_bytes(content)
+        return Succeeded(report={"results": []}, out=out)
+
+    monkeypatch.setattr(job_execution, "run_attempt", made)
+    export_id, job_id = ask(world, scene_id, "kitti")
+    assert job_id is not None
+    before = {item.key for item in world.artifacts.objects()}
+    job = run(world, job_id)
+    assert job.state == "SUCCEEDED", job.problem
+    with world.database.read() as session:
+        blob_ids = [file.blob_id for file in session.query(ExportFile).filter_by(export_id=export_id)]
+        recorded = {session.get_one(Blob, blob_id).key for blob_id in blob_ids}
+    assert (len(blob_ids), len(recorded)) == (3, 2)
+    assert {item.key for item in world.artifacts.objects()} - before == recorded
 
 
 @pytest.mark.slow
