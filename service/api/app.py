@@ -13,6 +13,7 @@ from fastapi import FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from obstore.exceptions import BaseError
 from sqlalchemy.exc import InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import InternalError as RefusedByDatabase
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
@@ -214,8 +215,11 @@ def _answer_errors(app: FastAPI) -> None:
 
     @app.exception_handler(PoolTimeout)
     @app.exception_handler(InterfaceError)
+    @app.exception_handler(RefusedByDatabase)
     @app.exception_handler(OperationalError)
     async def database(request: Request, error: SQLAlchemyError) -> Response:
+        if isinstance(error, RefusedByDatabase) and not error.connection_invalidated:
+            raise error
         if any(words in str(error) for words in _DATABASE_FULL):
             return problem_response(_disk_full())
         log.error("the database does not answer", exc_info=error)

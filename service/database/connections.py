@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sqlalchemy import Engine, create_engine, event, inspect, text
+from sqlalchemy import Engine, ExceptionContext, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
@@ -24,6 +24,7 @@ Result = TypeVar("Result")
 MIGRATIONS = Path(__file__).parent / "migrations"
 # PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
 _TRY_AGAIN = frozenset({"40001", "40P01"})
+_READ_ONLY = "25006"
 MAX_ATTEMPTS = 5  # of one transaction
 WAIT_S = 0.05  # at most, before the second; twice as long before each later one
 # An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
@@ -125,7 +126,16 @@ def _server(url: str, timeout_s: float) -> Engine:
         "tcp_user_timeout": 20_000,
         "options": f"-c statement_timeout={round(4000 * timeout_s)} {chosen}".rstrip(),
     }
-    return create_engine(url, pool_pre_ping=True, connect_args=options, **_ENGINE)
+    engine = create_engine(url, pool_pre_ping=True, connect_args=options, **_ENGINE)
+
+    @event.listens_for(engine, "handle_error")
+    def _leave(context: ExceptionContext) -> None:
+        # A server that became a standby, or that a name led to for a moment after another took over, answers and takes
+        # nothing: connections to it would stay in the pool for as long as this process lives.
+        if getattr(context.original_exception, "sqlstate", None) == _READ_ONLY:
+            context.is_disconnect = True
+
+    return engine
 
 
 def _sqlite(url: str, timeout_s: float) -> Engine:

@@ -110,6 +110,18 @@ def test_not_ready_where_the_database_refuses_writes(database_settings: Settings
         assert "database" in problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")["detail"]
 
 
+def test_connections_to_a_server_that_became_a_standby_are_left(postgres_api: Api) -> None:
+    """It answers, so that nothing else tells them apart from good ones: all writes would fail for ever."""
+    client, raw = postgres_api.client(), tiny_drive().raw
+    engine = postgres_api.context.database.engine
+    engine.dispose()
+    with engine.connect() as connection:  # the only one in the pool
+        connection.execute(text("SET SESSION CHARACTERISTICS AS TRANSACTION READ ONLY"))
+        connection.commit()
+    problem_of(client.post("/v1/drives", content=raw), 503, "database-unavailable")
+    assert client.post("/v1/drives", content=raw).status_code == 201
+
+
 def test_metrics_go_on_without_a_database(start_api: StartApi) -> None:
     api = start_api()
     assert metrics_of(api)["mrasfm_database_up{}"] == 1
