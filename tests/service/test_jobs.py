@@ -11,7 +11,7 @@ from typing import Any
 
 import httpx
 import pytest
-from sqlalchemy import insert
+from sqlalchemy import insert, inspect, select
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -306,6 +306,23 @@ def test_the_quota_of_jobs(api: Api) -> None:
     client.post(f"/v1/jobs/{job['id']}:cancel")
     client.reconstruct(drive_id)
     problem_of(client.post(f"/v1/jobs/{job['id']}:retry"), 429, "too-many-jobs")
+
+
+def test_a_heartbeat_changes_nothing_that_an_index_has(postgres_api: Api) -> None:
+    """Else PostgreSQL writes to all indexes of the table each second of each running job, and has to vacuum them."""
+    client, database = postgres_api.client(), postgres_api.database
+    job_id = client.reconstruct(client.committed())["id"]
+    with database.write() as session:
+        held = jobs.claim(session, job_id, owner="w", lease_us=LEASE_US)
+        assert held is not None
+        row = select(*Job.__table__.columns).where(Job.id == job_id)
+        before = session.execute(row).one()._mapping
+        jobs.heartbeat(session, held, lease_us=LEASE_US + 1, note=note(10.0))
+        after = session.execute(row).one()._mapping
+    changed = {name for name in after if after[name] != before[name]}
+    indexed = {name for index in inspect(database.engine).get_indexes("jobs") for name in index["column_names"]}
+    assert {"lease_until_us", "percent", "revision"} <= changed
+    assert changed & indexed == set()
 
 
 def test_the_quota_of_jobs_is_counted_without_thejob_history(api: Api) -> None:
