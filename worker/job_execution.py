@@ -23,6 +23,7 @@ from service.database.connections import Database
 from service.domain import jobs
 from service.domain.drive_checkout import DriveGoneError
 from service.domain.exports import ExportGoneError
+from service.job_queue import BrokerError, JobQueue
 from service.logs import log_fields
 from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
@@ -78,6 +79,7 @@ class Runner:
         self._shutting_down = shutting_down
         self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore(settings)
+        self._job_queue = JobQueue(settings)
         self._owner = f"{socket.gethostname()}:{os.getpid()}"
 
     def run(self, job_id: str) -> None:
@@ -96,6 +98,22 @@ class Runner:
                 execution.run(prepare=self.sweep_scratch)
             except jobs.FencedError:
                 log.warning("the job is not ours any more; nothing was published")
+            else:
+                self._wake_up_after(job_id)
+
+    def _wake_up_after(self, job_id: str) -> None:
+        """Tell workers about jobs that may begin now; what fails here the reconciler does some seconds later."""
+        try:
+            with self._database.read() as session:
+                waiting = jobs.due_after(session, job_id)
+            if not waiting:
+                return
+            self._job_queue.send(waiting)
+            with self._database.write() as session:
+                jobs.mark_enqueued(session, [job.id for job in waiting])
+        except (BrokerError, SQLAlchemyError) as error:
+            fields = {"why": type(error).__name__}
+            log.warning("no worker was woken up", extra={"fields": fields})
 
     def sweep_scratch(self) -> None:
         """Remove what killed processes of this machine left behind, and end the leases of their jobs at once."""

@@ -92,6 +92,11 @@ def due(database: Database) -> set[str]:
         return {job.id for job in jobs.all_due(session)}
 
 
+def due_after(database: Database, job_id: str) -> set[str]:
+    with database.read() as session:
+        return {job.id for job in jobs.due_after(session, job_id)}
+
+
 def percents(database: Database, job_id: str) -> list[float]:
     with database.read() as session:
         found = session.scalars(select(JobEvent).where(JobEvent.job_id == job_id).order_by(JobEvent.id))
@@ -121,6 +126,20 @@ def test_a_planned_reconstruction_waits(database: Database, parent: jobs.Claim, 
     assert job_of(database, parent.job_id).state == JobState.SUCCEEDED
     told = percents(database, parent.job_id)
     assert told == sorted(told)
+
+
+def test_who_may_begin_after_whom(database: Database, parent: jobs.Claim, submaps: list[str]) -> None:
+    """The sub-maps after the plan, and the reconstruction after the last of them; no job of another tree."""
+    other = reconstructing(database, parent.project_id, new_drive(database, parent.project_id))
+    others = plan(database, other)
+    assert due_after(database, parent.job_id) == set(submaps)
+    for submap in submaps:
+        assert due_after(database, submap) == set()
+        finish(database, submap)
+    assert due_after(database, submaps[-1]) == {parent.job_id}
+    claimed(database, parent.job_id)
+    assert due_after(database, submaps[-1]) == set()
+    assert due_after(database, other.job_id) == set(others)
 
 
 def test_progress_of_sub_maps_is_their_parents(database: Database, parent: jobs.Claim, submaps: list[str]) -> None:
@@ -318,9 +337,25 @@ def test_an_aggregation_waits_for_sub_maps(database: Database, project_id: str, 
     third = claimed(database, first)
     with database.write() as session:
         scenes.publish(session, third, files={}, summary=SUMMARY, expires_us=None)
-    assert due(database) == {job.id}
+    assert due(database) == due_after(database, first) == {job.id}
     told = percents(database, job.id)
     assert told == sorted(told)
+
+
+def test_an_aggregation_may_begin_after_a_sub_map_failed(database: Database, project_id: str) -> None:
+    """The failure is its reconstruction's, and the other drives make a map."""
+    ids = [new_drive(database, project_id) for _ in range(3)]
+    with database.write() as session:
+        asked = AggregationRequest(drives=ids)
+        job, children = aggregations.create(session, project_id=project_id, asked=asked, job_expires_us=None)
+        first, *others = [child.id for child in children]
+    made = plan(database, claimed(database, first))
+    for other in others:
+        held = claimed(database, other)
+        with database.write() as session:
+            scenes.publish(session, held, files={}, summary=SUMMARY, expires_us=None)
+    fail(database, made[0])
+    assert due_after(database, made[0]) == {job.id}
 
 
 def test_cancelling_an_aggregation_ends_all_below(database: Database, project_id: str) -> None:

@@ -99,6 +99,17 @@ def test_a_tree_of_jobs(make_world: Callable[..., World], long_drive: Path, tmp_
 
 
 @pytest.mark.slow
+def test_workers_wake_one_another_up(make_world: Callable[..., World], long_drive: Path) -> None:
+    """A tree gets to its end by the workers alone: no job of it waits for the next pass of the reconciler."""
+    world = make_world(submap_workers=2)
+    world.start_worker()
+    job_id = world.ask(world.add_drive(long_drive), submaps=2)
+    assert world.wait_for_end(job_id).state == "SUCCEEDED"
+    assert world.outcomes(job_id) == ["planned", "succeeded"]
+    assert [job.enqueued_us is not None for job in submaps_of(world, job_id)] == [True] * 2
+
+
+@pytest.mark.slow
 def test_a_worker_is_killed_in_a_sub_map(make_world: Callable[..., World], long_drive: Path, tmp_path: Path) -> None:
     """It costs the stage that was under way: what the sub-map had finished is found again, elsewhere too."""
     world = make_world()  # the drive is cut for the workers that are there

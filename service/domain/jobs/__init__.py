@@ -26,7 +26,7 @@ from service.domain.jobs._leases import (
 )
 from service.domain.jobs._planning import SubmapPlace, wait_for_submaps
 from service.domain.jobs._queries import Claim, FencedError, active_of_drive, events_after
-from service.domain.jobs._queue import all_due, due, mark_enqueued
+from service.domain.jobs._queue import all_due, due, due_after, mark_enqueued
 from service.domain.jobs._requests import (
     OfTree,
     cancel_orphan,
@@ -62,6 +62,7 @@ __all__ = [
     "claim",
     "create",
     "due",
+    "due_after",
     "end_lease",
     "events_after",
     "expire_leases",

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from sqlalchemy import select, tuple_, update
+from sqlalchemy import Select, or_, select, tuple_, update
 from sqlalchemy.orm import Session, load_only
 
 from service.database.connections import clock_us
-from service.database.tables import Job, JobState, now_us
+from service.database.tables import Job, JobMember, JobState, now_us
 
 
 def due(session: Session, *, after: Job | None = None, limit: int = 1000) -> list[Job]:
@@ -19,12 +19,10 @@ def due(session: Session, *, after: Job | None = None, limit: int = 1000) -> lis
     after
         The last job of the page before.
     """
-    is_due = (Job.state == JobState.QUEUED) & (Job.not_before_us <= clock_us(session)) & (Job.waiting_for == 0)
-    statement = select(Job).where(is_due)
+    statement = _due(session)
     if after is not None:
         statement = statement.where(tuple_(Job.created_us, Job.id) > (after.created_us, after.id))
-    shown = load_only(Job.id, Job.kind, Job.fence, Job.created_us, raiseload=True)
-    return list(session.scalars(statement.options(shown).order_by(Job.created_us, Job.id).limit(limit)))
+    return list(session.scalars(statement.limit(limit)))
 
 
 def all_due(session: Session) -> Iterator[Job]:
@@ -33,6 +31,27 @@ def all_due(session: Session) -> Iterator[Job]:
     while page:
         yield from page
         page = due(session, after=page[-1])
+
+
+def due_after(session: Session, job_id: str) -> list[Job]:
+    """Jobs that the end of another one's attempt may have let begin: those made for it, and those that waited for it.
+
+    Parameters
+    ----------
+    job_id
+        The other one.
+    """
+    parent = select(Job.parent_id).where(Job.id == job_id)
+    ended = or_(JobMember.child_id == job_id, JobMember.child_id.in_(parent))  # a sub-map's failure is its parent's
+    aggregations = select(JobMember.job_id).where(ended)
+    related = or_(Job.parent_id == job_id, Job.id.in_(parent), Job.id.in_(aggregations))
+    return list(session.scalars(_due(session).where(related)))
+
+
+def _due(session: Session) -> Select[Job]:
+    is_due = (Job.state == JobState.QUEUED) & (Job.not_before_us <= clock_us(session)) & (Job.waiting_for == 0)
+    shown = load_only(Job.id, Job.kind, Job.fence, Job.created_us, raiseload=True)
+    return select(Job).where(is_due).options(shown).order_by(Job.created_us, Job.id)
 
 
 def mark_enqueued(session: Session, job_ids: Sequence[str]) -> None:
