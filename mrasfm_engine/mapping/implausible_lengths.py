@@ -11,9 +11,9 @@ import numpy as np
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
+from mrasfm_engine.mapping.vehicle_speed import MAX_SPEED_MPS, speeds_mps
 from schemas.findings import Finding, warning
 
-MAX_SPEED_MPS = 70.0  # 250 km/h: cars that map roads drive no faster
 FAST = 0.9  # of the intervals between units are slower: a vehicle may stand for most of a drive
 CAMERA_HEIGHT_M = 0.2, 6.0  # from a bumper's to above the roof of a lorry
 
@@ -36,12 +36,10 @@ def length_findings(mapper: Mapper, refinement: Refinement) -> list[Finding]:
 
 
 def _speed(mapper: Mapper) -> str | None:
-    units = np.flatnonzero(mapper.registered)
-    elapsed_s = np.diff(mapper.drive.timestamps_us[units]) / 1e6
-    if not len(elapsed_s):
+    speeds = speeds_mps(mapper)
+    if not len(speeds):
         return None
-    ways_m = np.linalg.norm(np.diff(mapper.state.unit_position_m[units], axis=0), axis=1)
-    speed_mps = float(np.quantile(ways_m / elapsed_s, FAST))
+    speed_mps = float(np.quantile(speeds, FAST))
     return f"the vehicle drives up to {speed_mps:.0f} m/s" if speed_mps > MAX_SPEED_MPS else None
 
 

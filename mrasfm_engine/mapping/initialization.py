@@ -15,6 +15,7 @@ from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.unit_registration import CameraViews, cameras_of, matrix_of, register_unit, rigid3d
+from mrasfm_engine.mapping.vehicle_speed import MAX_SPEED_MPS, speeds_mps, usual_way_m
 from mrasfm_engine.matching.verification import parallax_rad
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Floats, Ints
@@ -104,7 +105,8 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
 
     For each of the best pairs of units by verified matches inside and between them, the sources of a relative pose are
     tried: points triangulated inside the first unit, and where these give no good start the prior poses and the
-    generalised relative pose. Each is adjusted; the pair with the most points of good angle is kept.
+    generalised relative pose. Each is adjusted; the pair with the most points of good angle is kept, one between which
+    no road vehicle drives so fast only where there is no other.
 
     Raises
     ------
@@ -114,16 +116,17 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
     prior = prior_world_from_rig
     known = np.isfinite(prior[:, 0, 3]) if prior is not None else np.zeros(len(mapper.registered), dtype=np.bool_)
     scores = UnitScores.from_pairs(mapper, pairs)
-    best: tuple[int, Initialisation, Floats, Floats] | None = None
+    best: tuple[tuple[bool, int], Initialisation, Floats, Floats] | None = None
     # Not the same gap over and over: with a longer step points get better angles.
     for gap in sorted({v - u for u, v in scores.between})[:CANDIDATES]:
         u, v = scores.best_of_gap(gap)
         anchor = np.eye(4) if prior is None or not known[u] else prior[u]
         for method, pose in _proposals(mapper, pairs, u, v, anchor, prior if known[[u, v]].all() else None):
             points = _evaluate(mapper, u, v, anchor, pose, is_guess=method != INSIDE)
-            if best is None or points > best[0]:
+            rank = points >= MIN_POINTS and bool(speeds_mps(mapper)[0] <= MAX_SPEED_MPS), points
+            if best is None or rank > best[0]:
                 best = (
-                    points,
+                    rank,
                     Initialisation(units=(u, v), points=points, method=method),
                     mapper.state.world_from_rig[u],
                     mapper.state.world_from_rig[v],
@@ -131,10 +134,10 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
             if method == INSIDE and points >= GOOD_START_POINTS:
                 break  # the others are for cameras that share no view; that from images alone costs most
     mapper.clear()
-    if best is None or best[0] < MIN_POINTS:
+    if best is None or best[0][1] < MIN_POINTS:
         raise ReconstructionError(
             f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
-            f"best two units share {0 if best is None else best[0]} points",
+            f"best two units share {0 if best is None else best[0][1]} points",
             remedy="Check that the images show a textured scene while the car moves, that cameras and files are not "
             "mixed up, that intrinsics fit the images, and that rig_from_cam of every camera is right.",
             code="nothing-matches",
@@ -171,8 +174,16 @@ def _proposals(
         if mapper.drive.has_single_camera
         else _generalised_relative_pose(mapper, pairs, u, v)
     )
-    if relative is not None:
-        yield "generalised relative pose", anchor @ relative
+    if relative is None:
+        return
+    yield "generalised relative pose", anchor @ relative
+    if prior_world_from_rig is None and not mapper.drive.has_single_camera:
+        # Cameras that share no view hardly tell how far a vehicle goes that does not turn: an adjustment stays at the
+        # length that it begins with, be that many kilometres.
+        length_m = float(np.linalg.norm(relative[:3, 3]))
+        usual = relative.copy()
+        usual[:3, 3] *= usual_way_m(mapper, u, v) / max(length_m, 1e-9)
+        yield "generalised relative pose, at a usual speed", anchor @ usual
 
 
 def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int) -> Floats | None:
@@ -204,7 +215,7 @@ def _generalised_relative_pose(mapper: Mapper, pairs: Sequence[PairMatches], u: 
 def _single_camera_relative_pose(
     mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: int, prior_world_from_rig: Floats | None
 ) -> Floats | None:
-    """rig_u_from_rig_v of a rig with one camera: its length, which no image observes, is the prior's or one metre."""
+    """rig_u_from_rig_v of a rig with one camera: its length, which no image observes, is the prior's or a usual one."""
     a, b = _matches_between(mapper, pairs, u, v)
     options = pycolmap.RANSACOptions()
     options.max_error, options.random_seed = RELATIVE_ERROR_PX, mapper.config.seed
@@ -216,7 +227,7 @@ def _single_camera_relative_pose(
     result = pycolmap.estimate_essential_matrix(xy_a, xy_b, camera, camera, estimation_options=options)
     if result is None:
         return None
-    length_m = 1.0
+    length_m = usual_way_m(mapper, u, v)
     if prior_world_from_rig is not None:
         length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
     u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))

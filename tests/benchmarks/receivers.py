@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.alignment import align_rigid
-from mrasfm_engine.io.read_scene import read_poses
+from mrasfm_engine.geometry.alignment import align_rigid, align_similarity
+from mrasfm_engine.io.read_scene import read_json, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
-from tests.benchmarks.commands import evaluate, mrasfm
+from mrasfm_engine.types import Floats
+from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.positions import Receiver
 from tests.benchmarks.real_drives import DRIVES, imported
 from tests.benchmarks.table import Figure, exactly
@@ -27,6 +28,11 @@ WANDERING = Receiver(white_m=WHITE_M, wander_m=WANDER_M, declared_m=math.hypot(W
 EVERY, POOR_M = 5, 1.0
 TENTH, FIRSTS = 10, (0, 2, 4, 6, 8)
 METRES_A_DEGREE = 111_320.0
+# Halves of PandaSet's cameras: of the first no two share a view, so that hardly anything but the prior tells the scale.
+HALVES = (
+    ("front_camera", "left_camera", "back_camera"),
+    ("front_left_camera", "front_right_camera", "right_camera"),
+)
 
 Edit = Callable[[dict[str, Any]], None]
 
@@ -37,6 +43,7 @@ def receivers(data: Path, work: Path) -> Iterator[Figure]:
     yield from _sparse(data, work)
     yield from _slow(data, work)
     yield from _single_camera(data, work)
+    yield from _halves(data, work)
 
 
 def _wandering(data: Path, work: Path) -> Iterator[Figure]:
@@ -79,7 +86,7 @@ def _sparse(data: Path, work: Path) -> Iterator[Figure]:
         yield Figure(
             line="21",
             what=f"{real.name} without {' and '.join(pair)}: positions, difference to those with all cameras, RMS",
-            value=float(np.sqrt((off_m**2).sum(1).mean())),
+            value=_rms(np.linalg.norm(off_m, axis=1)),
             unit="m",
             most=0.02,
         )
@@ -121,6 +128,51 @@ def _single_camera(data: Path, work: Path) -> Iterator[Figure]:
             found = evaluate(edited.with_name(edited.name + ", scene"), edited)
             for kind, most in (("metric", most_m), ("similarity", most_similarity_m)):
                 yield Figure(line="21", what=f"{title}: {kind} RMSE", value=found[kind]["rmse_m"], unit="m", most=most)
+
+
+def _halves(data: Path, work: Path) -> Iterator[Figure]:
+    """PandaSet by either half of its cameras, without GNSS: both know its size, and find one shape, as they state."""
+    real = next(real for real in DRIVES if real.name == "pandaset_002")
+    drive = imported(data, real.name, work, *real.options)
+    positions_m, sigmas_m = [], []
+    for half in HALVES:
+        title = f"{real.name} by {', '.join(half)}, without GNSS"
+        edited = _edited(drive, work / title, _without([c for c in _cameras(drive) if c not in half]))
+        scene = edited.with_name(edited.name + ", scene")
+        mrasfm("reconstruct", edited, "--out", scene, "--no-gnss")
+        found = evaluate(scene, edited)
+        yield exactly("21", f"{title}: images registered", found["registered_images"], real.images // 2)
+        similarity_m = found["similarity"]["rmse_m"]
+        yield Figure(line="21", what=f"{title}: similarity RMSE", value=similarity_m, unit="m", most=0.010)
+        of_scale = (
+            abs(math.log(found["similarity"]["scale"]))
+            / read_report(scene)["by_stage"]["refinement"]["scale"]["sigma_relative"]
+        )
+        yield Figure(
+            line="21", what=f"{title}: error of the scale in its sigmas", value=of_scale, above=-1e-9, most=3.0
+        )
+        known = [u for u in read_json(scene / "poses.json")["units"] if "sigma_position_m" in u]
+        positions_m.append(np.array([u["world_from_rig"]["translation_m"] for u in known]))
+        sigmas_m.append(np.array([u["sigma_position_m"] for u in known]))
+    off_m = align_similarity(positions_m[0], positions_m[1]).apply(positions_m[1]) - positions_m[0]
+    across = np.argsort(np.ptp(positions_m[0], axis=0))[:2]  # along the way, sigmas have the scale's
+    yield Figure(
+        line="21",
+        what=f"{real.name}, halves apart: positions across the way, RMS",
+        value=_rms(off_m[:, across]),
+        unit="m",
+    )
+    yield Figure(
+        line="21",
+        what=f"{real.name}, halves apart: the same in sigmas",
+        value=_rms((off_m / np.hypot(*sigmas_m))[:, across]),
+        above=0.2,
+        most=3.0,
+    )
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def _cameras(drive: Path) -> list[str]:

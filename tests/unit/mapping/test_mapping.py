@@ -153,6 +153,40 @@ def test_initialisation_finds_the_relative_pose_of_two_units(cameras: int) -> No
     assert 1e-5 < float(se3.rotation_angle_deg(found[:3, :3] @ true[:3, :3].T)) < 0.2
 
 
+@pytest.mark.parametrize(
+    ("cameras", "used", "error_deg", "seed"), [(6, (0, 5), 0.5, 2), (6, (0, 5), 1.0, 1), (4, (0, 1), 1.0, 2)]
+)
+def test_a_straight_way_has_a_length_that_a_vehicle_drives(
+    cameras: int, used: tuple[int, ...], error_deg: float, seed: int
+) -> None:
+    """Cameras that share no view hardly tell how far a vehicle goes that does not turn. From whatever length the first
+    two units begin with, hundreds of times too long, the scene would never come back."""
+    rng = np.random.default_rng(seed)
+
+    def turned(rig_from_cam: np.ndarray) -> np.ndarray:
+        turns = se3.exp_so3(np.radians(error_deg) * rng.normal(size=(len(rig_from_cam), 3)))
+        return se3.transform(turns @ rig_from_cam[:, :3, :3], rig_from_cam[:, :3, 3])
+
+    simulated = make_simulated_drive(
+        units=16,
+        cameras=cameras,
+        points=1500,
+        straight=True,
+        seed=seed,
+        given=turned,
+        hidden=lambda unit, camera: camera not in used,
+    )
+    mapper, _ = reconstruct(simulated, config=EngineConfig(threads=1))
+    assert mapper.registered.all()
+    refined = refine(mapper)
+    found_m, true_m = (
+        np.linalg.norm(p[-1] - p[0]) for p in (mapper.state.unit_position_m, simulated.truth.world_from_rig[:, :3, 3])
+    )
+    assert refined.certainty is not None
+    assert 0.5 < found_m / true_m < 2.0
+    assert abs(np.log(found_m / true_m)) < 3.0 * refined.certainty.sigma_scale < 6.0
+
+
 def test_nothing_in_common_is_an_error_that_says_so() -> None:
     simulated = make_simulated_drive(units=3, cameras=2, points=100)
     mapper = make_model(simulated, [])

@@ -1,0 +1,25 @@
+"""Speeds of vehicles that map roads, where images do not tell how far the vehicle has gone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.types import Floats
+
+MAX_SPEED_MPS = 70.0  # 250 km/h: cars that map roads drive no faster
+USUAL_SPEED_MPS = 8.0  # 30 km/h: of walking pace and of a motorway, neither is a factor of six away
+
+
+def speeds_mps(mapper: Mapper) -> Floats:
+    """Speeds (registered - 1,) between registered units that follow one another."""
+    units = np.flatnonzero(mapper.registered)
+    elapsed_s = np.diff(mapper.drive.timestamps_us[units]) / 1e6
+    result: Floats = np.linalg.norm(np.diff(mapper.state.unit_position_m[units], axis=0), axis=1) / elapsed_s
+    return result
+
+
+def usual_way_m(mapper: Mapper, u: int, v: int) -> float:
+    """Metres between two units at a usual speed."""
+    elapsed_us = mapper.drive.timestamps_us[v] - mapper.drive.timestamps_us[u]
+    return USUAL_SPEED_MPS * abs(float(elapsed_us)) / 1e6
