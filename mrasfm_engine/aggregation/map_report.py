@@ -242,6 +242,7 @@ def _scene(result: MapResult, k: int) -> dict[str, Any]:
         "verdict": CONNECTED if connected else BY_POSITIONS,
         "component": result.component_of_scene[k],
         "map_from_scene": result.map_from_scene[k],
+        **({} if "factor" not in scene.report.get("scale", {}) else {"scaled": scene.report["scale"]}),
         **({"moved_from_positions_m": float(np.linalg.norm(moved - coarse))} if scene.is_placed else {}),
         **({} if positions is None else {"positions_bias_m": positions.bias_m}),
         "registered_units": int(scene.unit_registered.sum()),

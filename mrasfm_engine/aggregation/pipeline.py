@@ -95,6 +95,7 @@ def aggregate(
     run.report["settings"] = config.model_dump(mode="json")
     found = stages.scenes(run, named, remove, leave_out=leave_out)
     known = stages.association(run, found)
+    found = stages.at_length(run, found, known)
     seams = stages.seams(run, found, known)
     graph, loops, chains = _graph(found, known, seams, config)
     kept = stages.without_unplaced(

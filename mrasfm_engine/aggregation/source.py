@@ -164,6 +164,31 @@ class SourceScene:
             footprints={},
         )
 
+    def of_length(self, factor: float) -> SourceScene:
+        """The scene with all of its lengths, the rig's among them, times a factor."""
+        calibration = json.loads(json.dumps(self.calibration))
+        cameras = []
+        for camera in self.manifest.rig.cameras:
+            place_m = [factor * x for x in camera.rig_from_cam.translation_m]
+            pose = camera.rig_from_cam.model_copy(update={"translation_m": place_m})
+            cameras.append(camera.model_copy(update={"rig_from_cam": pose}))
+            document = calibration["cameras"][camera.name]
+            given_m = document["given"]["rig_from_cam"]["translation_m"]
+            document["refined"]["rig_from_cam"]["translation_m"] = place_m
+            document["difference"]["translation_m"] = np.subtract(place_m, given_m).tolist()
+        return replace(
+            self,
+            manifest=self.manifest.model_copy(
+                update={"rig": self.manifest.rig.model_copy(update={"cameras": cameras})}
+            ),
+            calibration=calibration,
+            world_from_rig=_scaled(self.world_from_rig, factor),
+            sigma_position_m=factor * self.sigma_position_m,
+            unit_from_image=_scaled(self.unit_from_image, factor),
+            points_m=factor * self.points_m,
+            footprints={},
+        )
+
     def keypoints_with_points(self, image: int) -> Ints:
         """Keypoints (rows of the whole scene) of an image that observe a point."""
         rows = np.arange(self.keypoint_first[image], self.keypoint_first[image + 1])
@@ -192,6 +217,13 @@ class SourceScene:
         manifest = DriveManifest.model_validate(documents["manifest"])
         everything: dict[str, Any] = {**rest, **arrays}
         return SourceScene(name=name, manifest=manifest, **everything)
+
+
+def _scaled(poses: Floats, factor: float) -> Floats:
+    """Poses (n, 4, 4) with their translations times a factor."""
+    result = poses.copy()
+    result[:, :3, 3] *= factor
+    return result
 
 
 def unit_from_images(world_from_rig: Floats, world_from_cam: Floats, rig_from_cam: Floats, registered: Bools) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
 from mrasfm_engine.aggregation.load import components_of, not_georeferenced, read_scene
+from mrasfm_engine.aggregation.scales import SceneScale, find_scale, stated_sigma
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import EngineConfig
@@ -352,6 +353,49 @@ def _pairs_with_seams(into: Path | None, found: Sequence[SourceScene]) -> list[t
     row = {scene.name: k for k, scene in enumerate(found) if of_map.get(scene.name) == scene.fingerprint}
     ends = [(seam["a"], seam["b"]) for seam in document["seams"] if seam["accepted"]]
     return [(min(row[a], row[b]), max(row[a], row[b])) for a, b in ends if a in row and b in row]
+
+
+def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> list[SourceScene]:
+    """The scenes, those without positions as long as scenes with positions say that see the same.
+
+    One that these place says it for others in turn. Which are longer or shorter than by themselves the report says.
+    """
+    result = list(found)
+    settled = {k for k, scene in enumerate(found) if scene.is_placed}
+    waiting = [k for k, scene in enumerate(found) if not scene.is_placed and stated_sigma(scene)]
+    asked: set[tuple[int, int]] = set()
+    while True:
+        before = len(settled)
+        for k in [k for k in waiting if k not in settled]:
+            others = {sum(pair) - k for pair in known.pairs if k in pair} & settled
+            new = sorted(other for other in others if (k, other) not in asked)
+            asked.update((k, other) for other in new)
+            scales = [
+                find_scale(result[other], found[k], run.components.matcher, run.config, cancel=run.cancel)
+                for other in new
+            ]
+            best = min((scale for scale in scales if scale is not None), key=lambda scale: scale.sigma, default=None)
+            if best is not None:
+                settled.add(k)
+                result[k] = _of_length(run, found[k], best)
+        if len(settled) == before:
+            return result
+
+
+def _of_length(run: Run, scene: SourceScene, scale: SceneScale) -> SourceScene:
+    """The scene at the length that another one gives it, where that differs from its own; the report says so."""
+    if not scale.is_of(scene, run.config.aggregation):
+        return scene
+    run.found(
+        warning(
+            "scene-scaled",
+            f"scene {scene.name} is {scale.factor:.3f} times as long as by itself: {scale.by} says that to "
+            f"{100 * scale.sigma:.2f} %, where the scene knew its length to {100 * stated_sigma(scene):.1f} %",
+            "Give its drive GNSS, or sigma_translation_m of cameras that are known better.",
+        )
+    )
+    stated = {"sigma_relative": scale.sigma, "from": f"scene {scale.by}", "factor": scale.factor}
+    return replace(scene.of_length(scale.factor), report={**scene.report, "scale": stated})
 
 
 def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Seam]:
