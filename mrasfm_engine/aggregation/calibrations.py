@@ -85,6 +85,8 @@ def _all_priors(
         known = np.where(observed, np.minimum(sigma / np.sqrt(left), given), given)
         number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
         poses, held = scene.drive.rig_from_cam, ~observed
+        if not scene.is_placed:
+            held[:, 3:] = False  # other scenes tell its length, and thereby its baselines'
         if told is not None:
             poses, known, held = _with_expected(poses, known, held, told, left)
         priors.append(

@@ -440,6 +440,18 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     assert calibration_priors(assembly, state, assembly.registered, held) == []
 
 
+def test_baselines_of_a_scene_without_positions_follow_the_other_scenes(street: Street, folder: Path) -> None:
+    """Its own drive did not observe them, and the map's length is that of the others."""
+    drives = [drive_along(street, folder / f"length{k}", WAYS[k], cameras_off_deg=0.1, seed=40 + k) for k in range(2)]
+    scenes = [drives[0].source, replace(drives[1].source, is_placed=False)]
+    assembly = Assembly(scenes=scenes)
+    state = assembly.state(np.stack([d.street_from_scene for d in drives]))
+    placed, unplaced = calibration_priors(assembly, state, assembly.registered, CONFIG.bundle_adjustment)
+    assert placed.held[:, 3:].all()
+    assert not unplaced.held.any()
+    np.testing.assert_allclose(unplaced.sigma[:, 3:], CONFIG.bundle_adjustment.sigma_translation_m)
+
+
 def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
     """Up is elsewhere at the other end of a degree: 110 km north, vehicles stand 1 deg inclined to the map's frame."""
     north = make_street(length_m=20.0, points=700, place=(PLACE[0] + 1.0, *PLACE[1:]), seed=5)
