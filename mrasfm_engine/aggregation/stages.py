@@ -361,6 +361,8 @@ def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> lis
     One that these place says it for others in turn. Which are longer or shorter than by themselves the report says.
     """
     result = list(found)
+    if not run.config.aggregation.agreeing_units:  # one unit alone tells no length
+        return result
     settled = {k for k, scene in enumerate(found) if scene.is_placed}
     waiting = [k for k, scene in enumerate(found) if not scene.is_placed and stated_sigma(scene)]
     asked: set[tuple[int, int]] = set()
