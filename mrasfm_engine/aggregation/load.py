@@ -281,7 +281,7 @@ def _arrays(
 def _scale(report: dict[str, Any]) -> dict[str, Any]:
     """The part of a report on the scene's scale."""
     found = [stage["scale"] for stage in report.get("stages", ()) if "scale" in stage]
-    return {"scale": found[-1]} if found else {}
+    return {"scale": {key: found[-1][key] for key in ("sigma_relative", "from") if key in found[-1]}} if found else {}
 
 
 def features_kind(report: dict[str, Any]) -> str:

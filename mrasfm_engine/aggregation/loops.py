@@ -58,10 +58,9 @@ class ScenePaths:
     @staticmethod
     def from_scene(scene: SourceScene, *, most_scale: float) -> ScenePaths:
         """The paths through a scene, of which seams let scales differ by up to `most_scale`."""
-        known = scene.report.get("scale", {}).get("sigma_relative")
         largest = UNKNOWN_SCALE_SHARE * most_scale
-        sigma = float(known) if isinstance(known, int | float) and known >= 0 else largest
-        return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=min(sigma, largest))
+        sigma = largest if scene.sigma_scale is None else min(scene.sigma_scale, largest)
+        return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=sigma)
 
     @cached_property
     def _turns(self) -> tuple[Floats, Floats]:

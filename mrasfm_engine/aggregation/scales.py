@@ -50,16 +50,23 @@ class SceneScale:
     sigma: float  # relative
     units: int  # that agree
 
-    def is_of(self, scene: SourceScene, settings: AggregationConfig) -> bool:
-        """True where the scene is not so long by itself, but may be by the uncertainty that it states."""
-        off, stated = abs(float(np.log(self.factor))), stated_sigma(scene)
-        return SIGNIFICANT * self.sigma < off <= MOST * stated + settings.max_scale_error
+    def may_be_of(self, scene: SourceScene, settings: AggregationConfig) -> bool:
+        """True where the scene may be so long by the uncertainty that it states; else this is rather another place."""
+        return self._off <= MOST * stated_sigma(scene) + settings.max_scale_error
+
+    @property
+    def is_significant(self) -> bool:
+        """The scene is longer or shorter than by itself."""
+        return self._off > SIGNIFICANT * self.sigma
+
+    @property
+    def _off(self) -> float:
+        return abs(float(np.log(self.factor)))
 
 
 def stated_sigma(scene: SourceScene) -> float:
     """Relative standard deviation of a scene's length as its report states it; zero where it states none."""
-    sigma = scene.report.get("scale", {}).get("sigma_relative")
-    return float(sigma) if sigma is not None and np.isfinite(sigma) else 0.0
+    return scene.sigma_scale or 0.0
 
 
 def find_scale(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -139,6 +140,12 @@ class SourceScene:
         found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
         known = [c["sigma"].get("focal_px", np.nan) if c["observed"].get("focal") else np.nan for c in found]
         return np.array(known, dtype=np.float64)
+
+    @cached_property
+    def sigma_scale(self) -> float | None:
+        """Relative standard deviation of the scene's lengths as its report states it; None where it states none."""
+        sigma = self.report.get("scale", {}).get("sigma_relative")
+        return float(sigma) if isinstance(sigma, int | float) and 0 <= sigma <= sys.float_info.max else None
 
     @property
     def midpoint_m(self) -> Floats:

@@ -349,44 +349,66 @@ def _pairs_with_seams(into: Path | None, found: Sequence[SourceScene]) -> list[t
     document = None if into is None else map_document(into)
     if document is None:
         return []
-    of_map = {entry["name"]: entry["fingerprint"] for entry in document["scenes"]}
-    row = {scene.name: k for k, scene in enumerate(found) if of_map.get(scene.name) == scene.fingerprint}
+    row = _rows_of_map(document, found)
     ends = [(seam["a"], seam["b"]) for seam in document["seams"] if seam["accepted"]]
     return [(min(row[a], row[b]), max(row[a], row[b])) for a, b in ends if a in row and b in row]
+
+
+def _rows_of_map(document: Mapping[str, Any], found: Sequence[SourceScene]) -> dict[str, int]:
+    """Indices of the scenes that are in a map as they are, by name."""
+    of_map = {entry["name"]: entry["fingerprint"] for entry in document["scenes"]}
+    return {scene.name: k for k, scene in enumerate(found) if of_map.get(scene.name) == scene.fingerprint}
 
 
 def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> list[SourceScene]:
     """The scenes, those without positions as long as scenes with positions say that see the same.
 
-    One that these place says it for others in turn. Which are longer or shorter than by themselves the report says.
+    One that these measure says it for others in turn. Scenes of a map that is extended stay as long as they are there:
+    the seams between them are those of this length. Which are longer or shorter than by themselves the report says.
     """
     result = list(found)
     if not run.config.aggregation.agreeing_units:  # one unit alone tells no length
         return result
-    settled = {k for k, scene in enumerate(found) if scene.is_placed}
-    waiting = [k for k, scene in enumerate(found) if not scene.is_placed and stated_sigma(scene)]
+    in_map = set() if run.into is None else set(_rows_of_map(map_document(run.into), found).values())
+    measured = {k for k, scene in enumerate(found) if scene.is_placed or k in in_map}
+    waiting = [k for k, scene in enumerate(found) if k not in measured and stated_sigma(scene)]
     asked: set[tuple[int, int]] = set()
     while True:
-        before = len(settled)
-        for k in [k for k in waiting if k not in settled]:
-            others = {sum(pair) - k for pair in known.pairs if k in pair} & settled
+        before = len(measured)
+        for k in [k for k in waiting if k not in measured]:
+            others = {sum(pair) - k for pair in known.pairs if k in pair} & measured
             new = sorted(other for other in others if (k, other) not in asked)
             asked.update((k, other) for other in new)
-            scales = [
-                find_scale(result[other], found[k], run.components.matcher, run.config, cancel=run.cancel)
-                for other in new
-            ]
-            best = min((scale for scale in scales if scale is not None), key=lambda scale: scale.sigma, default=None)
+            best = _best_scale(run, found[k], [result[other] for other in new])
             if best is not None:
-                settled.add(k)
-                result[k] = _of_length(run, found[k], best)
-        if len(settled) == before:
+                measured.add(k)
+                result[k] = _of_length(run, found[k], *best)
+        if len(measured) == before:
             return result
 
 
-def _of_length(run: Run, scene: SourceScene, scale: SceneScale) -> SourceScene:
-    """The scene at the length that another one gives it, where that differs from its own; the report says so."""
-    if not scale.is_of(scene, run.config.aggregation):
+def _best_scale(run: Run, scene: SourceScene, others: Iterable[SourceScene]) -> tuple[SceneScale, float] | None:
+    """The best known length of a scene in others that it may have, and its sigma with that of the other scene's own."""
+    scales = [
+        (find_scale(other, scene, run.components.matcher, run.config, cancel=run.cancel), other) for other in others
+    ]
+    possible = [
+        (scale, float(np.hypot(scale.sigma, stated_sigma(other))))
+        for scale, other in scales
+        if scale is not None and scale.may_be_of(scene, run.config.aggregation)
+    ]
+    return min(possible, key=lambda of: of[1], default=None)
+
+
+def _of_length(run: Run, scene: SourceScene, scale: SceneScale, sigma: float) -> SourceScene:
+    """The scene at the length that another one gives it, where that differs from its own; the report says so.
+
+    Parameters
+    ----------
+    sigma
+        Relative, of the length that it gets.
+    """
+    if not scale.is_significant:
         return scene
     run.found(
         warning(
@@ -396,7 +418,7 @@ def _of_length(run: Run, scene: SourceScene, scale: SceneScale) -> SourceScene:
             "Give its drive GNSS, or sigma_translation_m of cameras that are known better.",
         )
     )
-    stated = {"sigma_relative": scale.sigma, "from": f"scene {scale.by}", "factor": scale.factor}
+    stated = {"sigma_relative": sigma, "from": f"scene {scale.by}", "factor": scale.factor}
     return replace(scene.of_length(scale.factor), report={**scene.report, "scale": stated})
 
 

@@ -59,6 +59,25 @@ def found(a: SourceScene, b: SourceScene) -> Any:
     return find_scale(a, b, load_components(config, None).matcher, config, cancel=lambda: False)
 
 
+def test_what_a_report_says_of_the_scale_may_be_anything(street: Street, tmp_path: Path) -> None:
+    """Only a number is a statement; that a scene was scaled is a map's to say."""
+    folder = in_tunnel(street, tmp_path / "tunnel")
+    assert read_scene(folder, "tunnel").sigma_scale == STATED
+    report = json.loads((folder / "report.json").read_text())
+    for sigma in ("0.1", [0.1], None, float("nan"), float("inf"), -0.1, 10**400):
+        report["stages"][-1]["scale"] = {"sigma_relative": sigma, "factor": 2.0}
+        (folder / "report.json").write_text(json.dumps(report))
+        scene = read_scene(folder, "tunnel")
+        assert scene.sigma_scale is None
+        assert stated_sigma(scene) == 0.0
+        assert "factor" not in scene.report["scale"]
+    report["stages"][-1]["scale"] = None
+    (folder / "report.json").write_text(json.dumps(report))
+    with pytest.raises(InputError) as raised:
+        read_scene(folder, "tunnel")
+    assert raised.value.code == "damaged-scene"
+
+
 @pytest.mark.parametrize("scale", [0.75, 1.0, 1.3])
 def test_lengths_by_another_scene(street: Street, lit: Path, tmp_path: Path, scale: float) -> None:
     a, b = read_scene(lit, "lit"), read_scene(in_tunnel(street, tmp_path / "tunnel", scale=scale), "tunnel")
