@@ -91,6 +91,9 @@ def drive_of_scene(name: str) -> str:
     return name.partition(COMPONENT_MARK)[0]
 
 
+SCALES_CHECKPOINT = "scales"  # of an aggregation: lengths of its scenes without positions
+
+
 def seam_name(a: str, b: str) -> str:
     """Name the seam of two scenes, as no other two scenes' is named."""
     return f"{a}{BETWEEN_SCENES}{b}"

@@ -49,10 +49,16 @@ class SceneScale:
     factor: float
     sigma: float  # relative
     units: int  # that agree
+    sigma_by: float = 0.0  # relative, of the other scene's own length as it states it
 
     def may_be_of(self, scene: SourceScene, settings: AggregationConfig) -> bool:
         """True where the scene may be so long by the uncertainty that it states; else this is rather another place."""
         return self._off <= MOST * stated_sigma(scene) + settings.max_scale_error
+
+    @property
+    def sigma_of_length(self) -> float:
+        """Relative standard deviation of the length that the scene gets."""
+        return float(np.hypot(self.sigma, self.sigma_by))
 
     @property
     def is_significant(self) -> bool:
@@ -99,7 +105,7 @@ def find_scale(
         return None
     # Units err together, as do points: how far both ways are apart tells of that, the bend of a cost does not.
     sigma = float(np.hypot(best[1], np.log(best[0] / factor)))
-    return SceneScale(by=a.name, factor=best[0], sigma=sigma, units=units)
+    return SceneScale(by=a.name, factor=best[0], sigma=sigma, units=units, sigma_by=stated_sigma(a))
 
 
 def _seen_best(b: SourceScene, factor: float, seen: Matches2D3D, config: EngineConfig) -> tuple[float, float] | None:

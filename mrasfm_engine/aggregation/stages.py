@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from mrasfm_engine.registry import Components, load_components
 from mrasfm_engine.types import CountProgress, StageProgress
 from schemas.artifacts import (
     MAP_FILE,
+    SCALES_CHECKPOINT,
     SCENES_FOLDER,
     SEAMS_FOLDER,
     Stage,
@@ -36,7 +37,7 @@ from schemas.findings import Finding, as_json, listed, warning
 
 FAR_APART_M = 50_000.0
 MIN_DRIVES = 2
-SEAM_VERSION = 5  # see `mrasfm_engine.stages.VERSIONS`
+SEAM_VERSION, SCALES_VERSION = 5, 1  # see `mrasfm_engine.stages.VERSIONS`
 
 
 @dataclass
@@ -372,54 +373,66 @@ def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> lis
     in_map = set() if run.into is None else set(_rows_of_map(map_document(run.into), found).values())
     measured = {k for k, scene in enumerate(found) if scene.is_placed or k in in_map}
     waiting = [k for k, scene in enumerate(found) if k not in measured and stated_sigma(scene)]
-    asked: set[tuple[int, int]] = set()
+    if not waiting:
+        return result
+    key = fingerprint([(s.name, s.fingerprint) for s in found], known.pairs, waiting, _comparison(run), SCALES_VERSION)
+    kept = run.store.load(SCALES_CHECKPOINT, key)
+    if kept is None:
+        scales = _scales(run, found, known, measured, waiting)
+        run.store.save(SCALES_CHECKPOINT, key, {}, {str(k): asdict(scale) for k, scale in scales.items()})
+    else:
+        scales = {int(k): SceneScale(**scale) for k, scale in kept[1].items()}
+    for k, scale in scales.items():
+        result[k] = _of_length(found[k], scale)
+        if scale.is_significant:
+            run.found(_scaled(found[k], scale))
+    return result
+
+
+def _scales(
+    run: Run, found: Sequence[SourceScene], known: Association, measured: Collection[int], waiting: Sequence[int]
+) -> dict[int, SceneScale]:
+    """Lengths of waiting scenes in scenes whose lengths are right, or were measured before; by index."""
+    at_length, result = {k: found[k] for k in measured}, dict[int, SceneScale]()
+    compared: set[tuple[int, int]] = set()
     while True:
-        before = len(measured)
-        for k in [k for k in waiting if k not in measured]:
-            others = {sum(pair) - k for pair in known.pairs if k in pair} & measured
-            new = sorted(other for other in others if (k, other) not in asked)
-            asked.update((k, other) for other in new)
-            best = _best_scale(run, found[k], [result[other] for other in new])
+        before = len(result)
+        for k in [k for k in waiting if k not in result]:
+            others = {sum(pair) - k for pair in known.pairs if k in pair} & at_length.keys()
+            new = sorted(other for other in others if (k, other) not in compared)
+            compared.update((k, other) for other in new)
+            best = _best_scale(run, found[k], [at_length[other] for other in new])
             if best is not None:
-                measured.add(k)
-                result[k] = _of_length(run, found[k], *best)
-        if len(measured) == before:
+                result[k], at_length[k] = best, _of_length(found[k], best)
+        if len(result) == before:
             return result
 
 
-def _best_scale(run: Run, scene: SourceScene, others: Iterable[SourceScene]) -> tuple[SceneScale, float] | None:
-    """The best known length of a scene in others that it may have, and its sigma with that of the other scene's own."""
-    scales = [
-        (find_scale(other, scene, run.components.matcher, run.config, cancel=run.cancel), other) for other in others
-    ]
-    possible = [
-        (scale, float(np.hypot(scale.sigma, stated_sigma(other))))
-        for scale, other in scales
-        if scale is not None and scale.may_be_of(scene, run.config.aggregation)
-    ]
-    return min(possible, key=lambda of: of[1], default=None)
+def _best_scale(run: Run, scene: SourceScene, others: Iterable[SourceScene]) -> SceneScale | None:
+    """The best known length of a scene in others that it may have; None where none of them measures it."""
+    possible = []
+    for other in others:
+        scale = find_scale(other, scene, run.components.matcher, run.config, cancel=run.cancel)
+        if scale is not None and scale.may_be_of(scene, run.config.aggregation):
+            possible.append(scale)
+    return min(possible, key=lambda scale: scale.sigma_of_length, default=None)
 
 
-def _of_length(run: Run, scene: SourceScene, scale: SceneScale, sigma: float) -> SourceScene:
-    """The scene at the length that another one gives it, where that differs from its own; the report says so.
-
-    Parameters
-    ----------
-    sigma
-        Relative, of the length that it gets.
-    """
+def _of_length(scene: SourceScene, scale: SceneScale) -> SourceScene:
+    """The scene at the length that another one gives it, where that differs from its own."""
     if not scale.is_significant:
         return scene
-    run.found(
-        warning(
-            "scene-scaled",
-            f"scene {scene.name} is {scale.factor:.3f} times as long as by itself: {scale.by} says that to "
-            f"{100 * scale.sigma:.2f} %, where the scene knew its length to {100 * stated_sigma(scene):.1f} %",
-            "Give its drive GNSS, or sigma_translation_m of cameras that are known better.",
-        )
-    )
-    stated = {"sigma_relative": sigma, "from": f"scene {scale.by}", "factor": scale.factor}
+    stated = {"sigma_relative": scale.sigma_of_length, "from": f"scene {scale.by}", "factor": scale.factor}
     return replace(scene.of_length(scale.factor), report={**scene.report, "scale": stated})
+
+
+def _scaled(scene: SourceScene, scale: SceneScale) -> Finding:
+    return warning(
+        "scene-scaled",
+        f"scene {scene.name} is {scale.factor:.3f} times as long as by itself: {scale.by} says that to "
+        f"{100 * scale.sigma:.2f} %, where the scene knew its length to {100 * stated_sigma(scene):.1f} %",
+        "Give its drive GNSS, or sigma_translation_m of cameras that are known better.",
+    )
 
 
 def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Seam]:
@@ -466,6 +479,11 @@ def seams(run: Run, found: Sequence[SourceScene], known: Association) -> list[Se
 
 def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
     """Fingerprint of a seam: both scenes' content, in this order, settings, models and version; not their names."""
+    return fingerprint(a.fingerprint, b.fingerprint, *_comparison(run), SEAM_VERSION)
+
+
+def _comparison(run: Run) -> tuple[object, ...]:
+    """Settings and models that a comparison of two scenes depends on."""
     config = run.config
     settings = [
         config.matching.model_dump(),
@@ -474,5 +492,4 @@ def seam_key(run: Run, a: SourceScene, b: SourceScene) -> str:
         config.seed,
     ]
     aggregation = config.aggregation.model_dump(exclude={"candidates", "multi_scene_adjustment", "final_adjustment"})
-    models = run.components.fingerprint_of("matcher")
-    return fingerprint(a.fingerprint, b.fingerprint, settings, aggregation, models, SEAM_VERSION)
+    return settings, aggregation, run.components.fingerprint_of("matcher")

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from schemas.artifacts import checkpoint_file, seam_checkpoint, submap_number
+from schemas.artifacts import SCALES_CHECKPOINT, checkpoint_file, seam_checkpoint, submap_number
 from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
@@ -39,7 +39,7 @@ class DriveShelf:
 
 @dataclass(frozen=True)
 class MapShelf:
-    """Stages of an aggregation: each of a pair of scenes, wherever in the project the two were put together before.
+    """Stages of an aggregation: of all its scenes, and of each pair, wherever in the project these were put together.
 
     Attributes
     ----------
@@ -63,6 +63,8 @@ class MapShelf:
             for b, second in scenes.items()
             if a != b
         }
+        together = f"{json.dumps(dict(scenes), sort_keys=True)} {under}"
+        digests[checkpoint_file(SCALES_CHECKPOINT)] = hashlib.sha256(together.encode()).hexdigest()
         return MapShelf(map_id, project_id, digests)
 
 

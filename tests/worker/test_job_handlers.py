@@ -37,8 +37,12 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
 def test_every_pair_of_scenes_has_a_checkpoint_of_its_own_name() -> None:
     scenes = {name: f"scn_{number}" for number, name in enumerate(("a", "a--b", "b--c", "c"))}
     shelf = MapShelf.from_scenes("map_1", "prj_1", scenes=scenes, settings={})
-    assert set(shelf.digests) == {f"seam-{a}~{b}.npz" for a, b in permutations(scenes, 2)}
-    assert len(shelf.digests) == len(set(shelf.digests.values())) == 12
+    seams = {f"seam-{a}~{b}.npz" for a, b in permutations(scenes, 2)}
+    assert set(shelf.digests) == {*seams, "scales.npz"}, "and lengths of scenes without positions one for all"
+    assert len(shelf.digests) == len(set(shelf.digests.values())) == 13
+    fewer = MapShelf.from_scenes("map_1", "prj_1", scenes={"a": "scn_0", "c": "scn_3"}, settings={})
+    assert shelf.digests["seam-a~c.npz"] == fewer.digests["seam-a~c.npz"]
+    assert shelf.digests["scales.npz"] != fewer.digests["scales.npz"]
 
 
 def test_a_sub_map_brings_its_own_stages_and_the_plans(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.association import Association
-from mrasfm_engine.aggregation.scales import SceneScale
+from mrasfm_engine.aggregation.scales import SceneScale, stated_sigma
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.io.stage_store import StageStore
 from tests.helpers.small_scenes import Street, configured, drive_along, make_street
@@ -42,7 +42,7 @@ class Lengths:
     def _found(self, a: SourceScene, b: SourceScene, *_: Any, **__: Any) -> SceneScale | None:
         self.asked.append((a.name, b.name))
         factor, sigma = self.says.get((a.name, b.name), (0.0, 0.0))
-        return SceneScale(by=a.name, factor=factor, sigma=sigma, units=5) if factor else None
+        return SceneScale(by=a.name, factor=factor, sigma=sigma, units=5, sigma_by=stated_sigma(a)) if factor else None
 
     def at_length(
         self, pairs: tuple[tuple[int, int], ...] = ALL, *, into: Path | None = None
@@ -99,6 +99,20 @@ def test_scenes_of_a_map_that_is_extended_stay_as_long_as_there(lengths: Lengths
     assert factor_of(again) == 1.1
     assert factor_of(far) == 1.1
     assert len(findings) == 1
+
+
+def test_lengths_are_not_measured_again(lengths: Lengths) -> None:
+    """A run that goes on where another was killed finds them, to the last bit: seams are those of this length."""
+    lengths.says = {("lit", "near"): (1.1, 0.003), ("near", "far"): (0.9, 0.004)}
+    before, findings = lengths.at_length()
+    assert len(lengths.asked) == 3
+    again, found_again = lengths.at_length()
+    assert len(lengths.asked) == 3
+    assert [scene.fingerprint for scene in again] == [scene.fingerprint for scene in before]
+    assert found_again == findings
+    lengths.scenes[FAR] = replace(lengths.scenes[FAR], points_m=1.01 * lengths.scenes[FAR].points_m)
+    lengths.at_length()
+    assert len(lengths.asked) == 6
 
 
 def test_the_nearest_to_positions_decides(lengths: Lengths) -> None:
