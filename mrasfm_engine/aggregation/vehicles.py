@@ -193,6 +193,9 @@ def _calibration(
         np.column_stack([corrections(poses, base), np.log(focal / base_focal_px)])
         for poses, focal in ((scene.drive.rig_from_cam, focal_px), (scene.given_rig_from_cam, given_focal_px))
     )
+    factor = scene.report.get("scale", {}).get("factor")
+    if factor is not None:  # about the rig's origin: all cameras moved together, which no image shows
+        found[:, TRANSLATION] -= (1.0 - 1.0 / factor) * scene.drive.rig_from_cam[:, :3, 3].mean(0)
     sigma = sigma_given.copy()
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]

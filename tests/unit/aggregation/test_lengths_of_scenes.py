@@ -14,6 +14,7 @@ from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.scales import SceneScale, stated_sigma
 from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.vehicles import vehicles_of
 from mrasfm_engine.io.stage_store import StageStore
 from tests.helpers.small_scenes import Street, configured, drive_along, make_street
 
@@ -120,3 +121,32 @@ def test_the_nearest_to_positions_decides(lengths: Lengths) -> None:
     lengths.says = {("lit", "near"): (1.1, 0.01), ("lit", "far"): (1.05, 0.005), ("near", "far"): (1.07, 0.002)}
     (_, _, far), _ = lengths.at_length()
     assert far.report["scale"]["from"] == "scene lit"
+
+
+def with_rig(source: SourceScene, name: str, found_m: np.ndarray, given_m: np.ndarray) -> SourceScene:
+    """The scene of a drive of a vehicle whose cameras have found positions (c, 3), and given ones."""
+    calibration = json.loads(json.dumps(source.calibration)) | {"adjusted": True}
+    cameras = []
+    for camera, at_m, declared_m in zip(source.manifest.rig.cameras, found_m.tolist(), given_m.tolist(), strict=True):
+        pose = camera.rig_from_cam.model_copy(update={"translation_m": at_m})
+        cameras.append(camera.model_copy(update={"rig_from_cam": pose}))
+        document = calibration["cameras"][camera.name]
+        document["given"]["rig_from_cam"]["translation_m"] = declared_m
+        document["sigma"] |= {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
+    rig = source.manifest.rig.model_copy(update={"cameras": cameras})
+    manifest = source.manifest.model_copy(update={"rig": rig, "vehicle": "van"})
+    return replace(source, name=name, manifest=manifest, calibration=calibration)
+
+
+def test_a_vehicle_does_not_learn_where_the_rig_of_a_scaled_scene_has_its_origin(source: SourceScene) -> None:
+    """A rig gets longer about its origin, so that all of its cameras move together; images do not show that."""
+    given_m = np.stack([pose[:3, 3] for pose in source.drive.rig_from_cam])
+    assert np.linalg.norm(given_m.mean(0)) > 1.0
+    longer_m = given_m + 0.1 * (given_m - given_m.mean(0))  # by positions, without a common motion
+    lit, dark = with_rig(source, "lit", longer_m, given_m), with_rig(source, "dark", given_m, given_m)
+    dark = stages._of_length(dark, SceneScale(by="lit", factor=1.1, sigma=0.001, units=5))
+    (vehicle,) = vehicles_of([lit, dark], configured().bundle_adjustment)
+    assert vehicle.knocked == []
+    assert 0.0 < vehicle.deviation_m < 0.01
+    for told in vehicle.expected.values():
+        assert 0.0 < np.abs(told.correction[:, 3:6]).max() < 0.02
