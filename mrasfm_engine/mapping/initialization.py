@@ -15,7 +15,7 @@ from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.unit_registration import CameraViews, cameras_of, matrix_of, register_unit, rigid3d
-from mrasfm_engine.mapping.vehicle_speed import MAX_SPEED_MPS, speeds_mps, usual_way_m
+from mrasfm_engine.mapping.vehicle_speed import MAX_SPEED_MPS, speeds_mps, usual_distance_m
 from mrasfm_engine.matching.verification import parallax_rad
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.types import Floats, Ints
@@ -182,7 +182,7 @@ def _proposals(
         # length that it begins with, be that many kilometres.
         length_m = float(np.linalg.norm(relative[:3, 3]))
         usual = relative.copy()
-        usual[:3, 3] *= usual_way_m(mapper, u, v) / max(length_m, 1e-9)
+        usual[:3, 3] *= usual_distance_m(mapper, u, v) / max(length_m, 1e-9)
         yield "generalised relative pose, at a usual speed", anchor @ usual
 
 
@@ -227,7 +227,7 @@ def _single_camera_relative_pose(
     result = pycolmap.estimate_essential_matrix(xy_a, xy_b, camera, camera, estimation_options=options)
     if result is None:
         return None
-    length_m = usual_way_m(mapper, u, v)
+    length_m = usual_distance_m(mapper, u, v)
     if prior_world_from_rig is not None:
         length_m = max(float(np.linalg.norm(prior_world_from_rig[v, :3, 3] - prior_world_from_rig[u, :3, 3])), 0.1)
     u_from_v = se3.inverse(matrix_of(result["cam2_from_cam1"]))

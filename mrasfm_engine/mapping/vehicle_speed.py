@@ -19,7 +19,7 @@ def speeds_mps(mapper: Mapper) -> Floats:
     return result
 
 
-def usual_way_m(mapper: Mapper, u: int, v: int) -> float:
+def usual_distance_m(mapper: Mapper, u: int, v: int) -> float:
     """Metres between two units at a usual speed."""
     elapsed_us = mapper.drive.timestamps_us[v] - mapper.drive.timestamps_us[u]
     return USUAL_SPEED_MPS * abs(float(elapsed_us)) / 1e6
