@@ -167,7 +167,7 @@ def _vehicle(
     left_out = frozenset((scene, one.camera) for one in vehicle.knocked for scene in one.scenes)
     for drive, one in zip(drives, found, strict=True):
         expected = _expected(one, found, deviation, left_out)
-        vehicle.expected.update(dict.fromkeys(drive, expected))
+        vehicle.expected.update({k: _of_component(expected, scenes[k], scenes[one.scene]) for k in drive})
     return vehicle
 
 
@@ -193,9 +193,7 @@ def _calibration(
         np.column_stack([corrections(poses, base), np.log(focal / base_focal_px)])
         for poses, focal in ((scene.drive.rig_from_cam, focal_px), (scene.given_rig_from_cam, given_focal_px))
     )
-    factor = scene.report.get("scale", {}).get("factor")
-    if factor is not None:  # about the rig's origin: all cameras moved together, which no image shows
-        found[:, TRANSLATION] -= (1.0 - 1.0 / factor) * scene.drive.rig_from_cam[:, :3, 3].mean(0)
+    found[:, TRANSLATION] -= _shift_by_scaling(scene)
     sigma = sigma_given.copy()
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]
@@ -213,6 +211,25 @@ def _calibration(
         information=information,
         given=given,
         sigma_given=sigma_given,
+    )
+
+
+def _shift_by_scaling(scene: SourceScene) -> Floats:
+    """Common motion (3,) of a scene's cameras where the scene was scaled: about the rig's origin. No image shows it."""
+    factor = scene.report.get("scale", {}).get("factor", 1.0)
+    result: Floats = (1.0 - 1.0 / factor) * scene.drive.rig_from_cam[:, :3, 3].mean(0)
+    return result
+
+
+def _of_component(expected: Expected, component: SourceScene, first: SourceScene) -> Expected:
+    """Expectation of the drive's cameras as corrections of a component's; it may be scaled by itself."""
+    off = np.zeros(expected.correction.shape)
+    off[:, TRANSLATION] = component.drive.rig_from_cam[:, :3, 3] - _shift_by_scaling(component)
+    off[:, TRANSLATION] -= first.drive.rig_from_cam[:, :3, 3] - _shift_by_scaling(first)
+    return replace(
+        expected,
+        correction=np.where(np.isfinite(expected.sigma), expected.correction - off, 0.0),
+        own=np.where(expected.information > 0, expected.own - off, 0.0),
     )
 
 

@@ -14,7 +14,7 @@ from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.scales import SceneScale, stated_sigma
 from mrasfm_engine.aggregation.source import SourceScene
-from mrasfm_engine.aggregation.vehicles import vehicles_of
+from mrasfm_engine.aggregation.vehicles import corrected, vehicles_of
 from mrasfm_engine.io.stage_store import StageStore
 from tests.helpers.small_scenes import Street, configured, drive_along, make_street
 
@@ -150,3 +150,19 @@ def test_a_vehicle_does_not_learn_where_the_rig_of_a_scaled_scene_has_its_origin
     assert 0.0 < vehicle.deviation_m < 0.01
     for told in vehicle.expected.values():
         assert 0.0 < np.abs(told.correction[:, 3:6]).max() < 0.02
+
+
+def test_a_component_that_was_scaled_does_not_get_the_vehicles_correction_twice(source: SourceScene) -> None:
+    given_m = np.stack([pose[:3, 3] for pose in source.drive.rig_from_cam])
+    longer_m = given_m + 0.1 * (given_m - given_m.mean(0))
+    lit, dark = with_rig(source, "lit", longer_m, given_m), with_rig(source, "dark", given_m, given_m)
+    part = replace(dark, name="dark#2")
+    scaled = stages._of_length(part, SceneScale(by="lit", factor=1.1, sigma=0.001, units=5))
+    expected_m = []
+    for scene in (part, scaled):
+        (vehicle,) = vehicles_of([lit, dark, scene], configured().bundle_adjustment)
+        told = vehicle.expected[2]
+        expected_m.append(corrected(scene.drive.rig_from_cam, told.correction[:, :6])[:, :3, 3])
+    expected_m = [at_m - at_m.mean(0) for at_m in expected_m]
+    np.testing.assert_allclose(expected_m[1], expected_m[0], atol=1e-9)
+    assert 0.0 < np.abs(expected_m[0] - (longer_m - longer_m.mean(0))).max() < 0.02
