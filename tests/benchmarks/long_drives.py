@@ -7,9 +7,7 @@ of which one is killed again and again.
 from __future__ import annotations
 
 import json
-import os
 import random
-import shutil
 import subprocess
 import tempfile
 import threading
@@ -20,6 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -33,6 +32,7 @@ from tests.benchmarks.chaos.installation import Installation
 from tests.benchmarks.chaos.processes import Role, kill, tree_of
 from tests.benchmarks.chaos.records import Records
 from tests.benchmarks.commands import MRASFM, CommandFailed, evaluate, mrasfm, read_report
+from tests.benchmarks.edited_drives import edited_drive
 from tests.benchmarks.table import Figure, exactly, failed
 from tests.helpers.submap_stages import stages_run_in_join
 
@@ -268,15 +268,14 @@ def _rendered(work: Path) -> Path:
 def _beginning(drive: Path, units: int) -> Path:
     """The first units of a drive as a drive beside it, with the same images."""
     beginning = drive.with_name(f"{drive.name}, {units} units")
-    shutil.copytree(drive, beginning, copy_function=os.link)
-    (beginning / "drive.json").unlink()  # else the original would be written as well
-    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
-    manifest["frames"] = manifest["frames"][:units]
-    end_us = manifest["frames"][-1]["timestamp_us"]
-    samples = manifest["gnss"]["samples"]
-    manifest["gnss"]["samples"] = [sample for sample in samples if sample["timestamp_us"] <= end_us]
-    (beginning / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return beginning
+
+    def edit(manifest: dict[str, Any]) -> None:
+        manifest["frames"] = manifest["frames"][:units]
+        end_us = manifest["frames"][-1]["timestamp_us"]
+        samples = manifest["gnss"]["samples"]
+        manifest["gnss"]["samples"] = [sample for sample in samples if sample["timestamp_us"] <= end_us]
+
+    return edited_drive(drive, beginning, edit)
 
 
 def _warm_up(work: Path) -> None:

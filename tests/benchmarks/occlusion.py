@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 import sqlite3
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +17,7 @@ from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.scene.drive import matrix_from_pose
 from schemas import Pose
 from tests.benchmarks.commands import mrasfm, read_report
+from tests.benchmarks.edited_drives import edited_drive
 from tests.benchmarks.table import Figure, exactly
 
 CAMERAS, UNITS = 6, 40
@@ -74,15 +74,14 @@ def _share(drive: Path, file: str) -> float:
 
 def without_masks(drive: Path, out: Path) -> Path:
     """The same images under a manifest that knows of no masks."""
-    shutil.copytree(drive, out, copy_function=os.link)
-    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
-    del manifest["label_map"]
-    for frame in manifest["frames"]:
-        for image in frame["images"].values():
-            del image["mask"]
-    (out / "drive.json").unlink()  # a link to the other drive's
-    (out / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return out
+
+    def edit(manifest: dict[str, Any]) -> None:
+        del manifest["label_map"]
+        for frame in manifest["frames"]:
+            for image in frame["images"].values():
+                del image["mask"]
+
+    return edited_drive(drive, out, edit)
 
 
 def with_the_set(drive: Path, scene: Path, cameras: Sequence[str], seed: int) -> Iterator[Figure]:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +16,7 @@ from mrasfm_engine.io.read_scene import read_json, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
 from mrasfm_engine.types import Floats
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.edited_drives import Edit, edited_drive
 from tests.benchmarks.positions import Receiver
 from tests.benchmarks.real_drives import DRIVES, imported
 from tests.benchmarks.table import Figure, exactly
@@ -33,8 +32,6 @@ HALVES = (
     ("front_camera", "left_camera", "back_camera"),
     ("front_left_camera", "front_right_camera", "right_camera"),
 )
-
-Edit = Callable[[dict[str, Any]], None]
 
 
 def receivers(data: Path, work: Path) -> Iterator[Figure]:
@@ -52,7 +49,7 @@ def _wandering(data: Path, work: Path) -> Iterator[Figure]:
     drive = imported(data, real.name, work, *real.options)
     errors = []
     for seed in range(SEEDS):
-        edited = _edited(drive, work / f"{real.name}, receiver {seed}", _wander(drive, seed))
+        edited = edited_drive(drive, work / f"{real.name}, receiver {seed}", _wander(drive, seed))
         mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
         found = evaluate(edited.with_name(edited.name + ", scene"), edited)
         yield exactly("21", f"{real.name}, receiver {seed}: images registered", found["registered_images"], real.images)
@@ -68,7 +65,7 @@ def _sparse(data: Path, work: Path) -> Iterator[Figure]:
     """KITTI raw with few poor positions, and with the good ones but without each pair of cameras."""
     real = next(real for real in DRIVES if real.name == "kitti_raw_0001")
     drive = imported(data, real.name, work, *real.options)
-    poor = _edited(drive, work / f"{real.name}, poor", _poor)
+    poor = edited_drive(drive, work / f"{real.name}, poor", _poor)
     mrasfm("reconstruct", poor, "--out", work / "poor scene")
     found = evaluate(work / "poor scene", poor)
     title = f"{real.name}, every {EVERY}th position, {POOR_M:.0f} m of noise"
@@ -79,7 +76,7 @@ def _sparse(data: Path, work: Path) -> Iterator[Figure]:
     whole_m = read_poses(work / "whole scene").trajectory.world_from_rig[:, :3, 3]
     cameras = _cameras(drive)
     for pair in (cameras[:2], cameras[2:]):
-        less = _edited(drive, work / f"{real.name} without {pair}", _without(pair))
+        less = edited_drive(drive, work / f"{real.name} without {pair}", _without(pair))
         mrasfm("reconstruct", less, "--out", less.with_name(less.name + ", scene"))
         less_m = read_poses(less.with_name(less.name + ", scene")).trajectory.world_from_rig[:, :3, 3]
         off_m = se3.apply(align_rigid(less_m, whole_m).a_from_b, whole_m) - less_m
@@ -97,7 +94,7 @@ def _slow(data: Path, work: Path) -> Iterator[Figure]:
     drive = imported(data, "kitti01", work)
     errors = []
     for first in FIRSTS:
-        edited = _edited(drive, work / f"kitti01, a position a second from {first}", _every(TENTH, first))
+        edited = edited_drive(drive, work / f"kitti01, a position a second from {first}", _every(TENTH, first))
         mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
         errors.append(evaluate(edited.with_name(edited.name + ", scene"), edited)["metric"]["rmse_m"])
     what = f"kitti01, one position a second, {len(FIRSTS)} choices of which: metric RMSE"
@@ -123,7 +120,7 @@ def _single_camera(data: Path, work: Path) -> Iterator[Figure]:
             (f"{name} without {' and '.join(others)}", _without(others)),
             (f"{name} without {' and '.join(others)}, every second frame", _every_second_without(others)),
         ):
-            edited = _edited(drive, work / title, edit)
+            edited = edited_drive(drive, work / title, edit)
             mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
             found = evaluate(edited.with_name(edited.name + ", scene"), edited)
             for kind, most in (("metric", most_m), ("similarity", most_similarity_m)):
@@ -137,7 +134,7 @@ def _halves(data: Path, work: Path) -> Iterator[Figure]:
     positions_m, sigmas_m = [], []
     for half in HALVES:
         title = f"{real.name} by {', '.join(half)}, without GNSS"
-        edited = _edited(drive, work / title, _without([c for c in _cameras(drive) if c not in half]))
+        edited = edited_drive(drive, work / title, _without([c for c in _cameras(drive) if c not in half]))
         scene = edited.with_name(edited.name + ", scene")
         mrasfm("reconstruct", edited, "--out", scene, "--no-gnss")
         found = evaluate(scene, edited)
@@ -178,16 +175,6 @@ def _rms(values: Floats) -> float:
 def _cameras(drive: Path) -> list[str]:
     manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
     return [camera["name"] for camera in manifest["rig"]["cameras"]]
-
-
-def _edited(drive: Path, copy: Path, edit: Edit) -> Path:
-    """A copy of the drive whose manifest is edited."""
-    shutil.copytree(drive, copy, copy_function=os.link)
-    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
-    edit(manifest)
-    (copy / "drive.json").unlink()  # a link to the other drive's
-    (copy / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return copy
 
 
 def _wander(drive: Path, seed: int) -> Edit:

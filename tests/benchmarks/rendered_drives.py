@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from mrasfm_engine.evaluation.trajectory import FIRST_UNITS, end_error_m
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.edited_drives import edited_drive
 from tests.benchmarks.table import Figure, exactly
 
 SEEDS = (1, 2, 3, 4, 5)
@@ -82,14 +82,13 @@ def tight(drive: Path, scene: Path) -> Iterator[Figure]:
 
 def _with_true_calibration(drive: Path, out: Path) -> Path:
     """The drive that `synth --tight` would render without the perturbation: the same images under another manifest."""
-    shutil.copytree(drive, out, copy_function=os.link)
-    manifest = json.loads((drive / "drive.json").read_text(encoding="utf-8"))
     truth = json.loads((drive / "truth_calibration.json").read_text(encoding="utf-8"))
-    for camera in manifest["rig"]["cameras"]:
-        camera |= {"rig_from_cam": truth[camera["name"]], **TIGHT}
-    (out / "drive.json").unlink()  # a link to the other drive's
-    (out / "drive.json").write_text(json.dumps(manifest), encoding="utf-8")
-    return out
+
+    def edit(manifest: dict[str, Any]) -> None:
+        for camera in manifest["rig"]["cameras"]:
+            camera |= {"rig_from_cam": truth[camera["name"]], **TIGHT}
+
+    return edited_drive(drive, out, edit)
 
 
 def error_of_the_end(found: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
