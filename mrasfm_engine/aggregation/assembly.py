@@ -86,11 +86,7 @@ class Assembly:
     @cached_property
     def keypoint_image(self) -> Ints:
         """(n,)."""
-        parts = [
-            np.repeat(np.arange(len(s.image_unit)), np.diff(s.keypoint_first)) + f
-            for s, f in zip(self.scenes, self.first_image, strict=False)
-        ]
-        return np.concatenate(parts)
+        return np.concatenate([s.keypoint_image + f for s, f in zip(self.scenes, self.first_image, strict=False)])
 
     @cached_property
     def keypoint_point(self) -> Ints:

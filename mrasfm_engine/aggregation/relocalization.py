@@ -9,13 +9,14 @@ relocalised again from the matches that do not fit, and several units with a goo
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.aggregation.source import SourceScene
+from mrasfm_engine.aggregation.source import SourceScene, scaled
 from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras, reprojection_errors_focal
@@ -60,11 +61,11 @@ class Relocalization:
     inliers: int  # image points that fit
 
 
-def matches_2d3d(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints, image_of_b: Ints) -> Matches2D3D:
+def matches_2d3d(a: SourceScene, b: SourceScene, keypoints_a: Ints, keypoints_b: Ints) -> Matches2D3D:
     """Matches (n,) of keypoints as image points of b and points of a, each pair of these once."""
     pairs = np.column_stack([keypoints_b, a.keypoint_point[keypoints_a]])
     _, first = np.unique(pairs, axis=0, return_index=True)
-    image = image_of_b[keypoints_b[first]]
+    image = b.keypoint_image[keypoints_b[first]]
     return Matches2D3D(
         unit=b.image_unit[image],
         image=image,
@@ -80,7 +81,13 @@ class Relocaliser:
         self._b, self._config, self._seed = b, config, seed
         self._kind, self._params = pack_cameras(b.drive.cameras)
         self._cameras = SolverCameras.from_cameras(b.drive.cameras, self._kind, self._params)
-        self._b_from_cam = b.world_from_cam
+        self.b_from_rig, self._b_from_cam = b.world_from_rig, b.world_from_cam
+
+    def of_length(self, factor: float) -> Relocaliser:
+        """The same for the scene with all of its lengths times a factor."""
+        result = copy.copy(self)
+        result.b_from_rig, result._b_from_cam = scaled(self.b_from_rig, factor), scaled(self._b_from_cam, factor)
+        return result
 
     def errors_focal(self, a_from_b: Floats, seen: Matches2D3D) -> Floats:
         """Reprojection errors (n,) in focal lengths if b lies so in a; infinite where a camera shows nothing."""
@@ -97,7 +104,7 @@ class Relocaliser:
         found = self._unit_pose(unit, own)
         if found is None:
             return None
-        a_from_b: Floats = found @ se3.inverse(self._b.world_from_rig[unit])
+        a_from_b: Floats = found @ se3.inverse(self.b_from_rig[unit])
         refined = self.refined(a_from_b, own)
         return a_from_b if refined is None else refined
 
@@ -108,7 +115,7 @@ class Relocaliser:
         if len(own.unit) < self._config.min_unit_inliers:
             return None
         images, eye = np.unique(own.image, return_inverse=True)
-        rig_from_eye = se3.inverse(self._b.world_from_rig[unit]) @ self._b_from_cam[images]
+        rig_from_eye = se3.inverse(self.b_from_rig[unit]) @ self._b_from_cam[images]
         cameras = [self._cameras.cameras[int(self._b.image_camera[i])] for i in images]
         ransac = pycolmap.RANSACOptions()
         focal = float(np.mean([self._params[int(self._b.image_camera[i]), :2].mean() for i in images]))
@@ -229,7 +236,7 @@ class Relocaliser:
         return _found(best, len(tried), runner_up, "")
 
     def _same_place(self, one: Floats, other: Floats, units: Ints) -> bool:
-        at = self._b.world_from_rig[units].mean(0)[:3, 3] if len(units) else np.zeros(3)
+        at = self.b_from_rig[units].mean(0)[:3, 3] if len(units) else np.zeros(3)
         shift = np.linalg.norm(se3.apply(one, at[None])[0] - se3.apply(other, at[None])[0])
         turn = float(se3.rotation_angle_deg(one[:3, :3] @ other[:3, :3].T))
         return bool(shift <= SAME_PLACE_M and turn <= SAME_PLACE_DEG)

@@ -91,27 +91,27 @@ def find_scale(
     cross = CrossMatcher(a, b, matcher, config.matching, threads=config.threads)
     pairs = np.concatenate([probe.pairs for probe in wanted])
     matches = CrossMatches.joined(cross.match(pairs, verified=True, cancel=cancel))
-    image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
-    seen = matches_2d3d(a, b, matches.a, matches.b, image_of_b)
+    seen = matches_2d3d(a, b, matches.a, matches.b)
+    relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
     factor, units = 1.0, 0
     for _ in range(ROUNDS):
-        places = _places(b.of_length(factor), seen, config)
+        places = _places(relocaliser.of_length(factor), seen, config.aggregation)
         found = None if places is None else _scale_between(*places, config.aggregation)
         if found is None:
             return None
         factor, units = factor * found[0], found[1]
-    best = _seen_best(b, factor, seen, config)
+    best = _seen_best(relocaliser.of_length(factor), seen)
     if best is None:
         return None
-    # Units err together, as do points: how far both ways are apart tells of that, the bend of a cost does not.
-    sigma = float(np.hypot(best[1], np.log(best[0] / factor)))
-    return SceneScale(by=a.name, factor=best[0], sigma=sigma, units=units, sigma_by=stated_sigma(a))
+    more, sigma = best
+    # Units err together, as do points: how far both estimates are apart tells of that, the bend of a cost does not.
+    sigma = float(np.hypot(sigma, np.log(more)))
+    return SceneScale(by=a.name, factor=factor * more, sigma=sigma, units=units, sigma_by=stated_sigma(a))
 
 
-def _seen_best(b: SourceScene, factor: float, seen: Matches2D3D, config: EngineConfig) -> tuple[float, float] | None:
-    """The length near a factor at which units of b, as one, see points of a best, with its relative sigma; None where
-    they do not agree how the scenes lie."""
-    relocaliser = Relocaliser(b.of_length(factor), config.aggregation, seed=config.seed)
+def _seen_best(relocaliser: Relocaliser, seen: Matches2D3D) -> tuple[float, float] | None:
+    """The factor near one on lengths at which all units together see points of a best, with its relative sigma; None
+    where they do not agree how the scenes lie."""
     placed = relocaliser.relocalise(seen)
     if placed.a_from_b is None:
         return None
@@ -122,7 +122,7 @@ def _seen_best(b: SourceScene, factor: float, seen: Matches2D3D, config: EngineC
 
     def cost(log_more: float) -> float:
         """Cost of the errors at the best place, in their usual size."""
-        longer = Relocaliser(b.of_length(factor * np.exp(log_more)), config.aggregation, seed=config.seed)
+        longer = relocaliser.of_length(float(np.exp(log_more)))
         a_from_b = longer.refined(begin, seen)
         if a_from_b is None:
             return np.inf
@@ -134,19 +134,18 @@ def _seen_best(b: SourceScene, factor: float, seen: Matches2D3D, config: EngineC
     bend = cost(at - STEP) + cost(at + STEP) - 2.0 * float(found.fun)
     if not (np.isfinite(bend) and bend > 0.0 and abs(at) < SEARCHED - STEP):
         return None
-    # Half of the median of two coordinates' lengths squared is 0.69 of a variance; what is usual is that of the start.
+    # The usual error squared passes for the variance, which it is 1.4 times; here errors are less than at the start.
     left = float(found.fun) / max(cost(0.0), 1e-12)
-    return factor * float(np.exp(at)), STEP * float(np.sqrt(CORRELATION * left / bend))
+    return float(np.exp(at)), STEP * float(np.sqrt(CORRELATION * left / bend))
 
 
-def _places(b: SourceScene, seen: Matches2D3D, config: EngineConfig) -> tuple[Floats, Floats] | None:
+def _places(relocaliser: Relocaliser, seen: Matches2D3D, settings: AggregationConfig) -> tuple[Floats, Floats] | None:
     """Poses (n, 4, 4) of units as b has them, and as each finds itself in a; None where too few do."""
-    relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
     units, counts = np.unique(seen.unit, return_counts=True)
-    tried = units[counts >= config.aggregation.min_unit_inliers]
+    tried = units[counts >= settings.min_unit_inliers]
     alone = {int(unit): relocaliser.hypothesis(int(unit), seen) for unit in tried}
-    own = [(b.world_from_rig[unit], a_from_b) for unit, a_from_b in alone.items() if a_from_b is not None]
-    if len(own) < max(config.aggregation.min_units, MIN_MAJORITY * len(tried)):
+    own = [(relocaliser.b_from_rig[unit], a_from_b) for unit, a_from_b in alone.items() if a_from_b is not None]
+    if len(own) < max(settings.min_units, MIN_MAJORITY * len(tried)):
         return None
     b_from_rig = np.stack([pose for pose, _ in own])
     return b_from_rig, np.stack([a_from_b for _, a_from_b in own]) @ b_from_rig
@@ -155,16 +154,17 @@ def _places(b: SourceScene, seen: Matches2D3D, config: EngineConfig) -> tuple[Fl
 def _scale_between(b_from_rig: Floats, a_from_rig: Floats, settings: AggregationConfig) -> tuple[float, int] | None:
     """Lengths in a by those in b, and how many units agree; None where too few do.
 
-    Of the similarities by two units each, the one with which most agree wins; of several, that of the longest way.
+    Of the similarities by two units each, the one with which most agree wins; of several, that of the units that are
+    farthest apart.
     """
     best: tuple[int, float] = 0, 0.0
     agreeing = np.zeros(0, dtype=np.int64)
     for i in range(len(b_from_rig)):
         for j in range(i + 1, len(b_from_rig)):
-            way_m = float(np.linalg.norm(b_from_rig[j, :3, 3] - b_from_rig[i, :3, 3]))
+            apart_m = float(np.linalg.norm(b_from_rig[j, :3, 3] - b_from_rig[i, :3, 3]))
             fitting = _agreeing(b_from_rig, a_from_rig, i, j)
-            if (len(fitting), way_m) > best:
-                best, agreeing = (len(fitting), way_m), fitting
+            if (len(fitting), apart_m) > best:
+                best, agreeing = (len(fitting), apart_m), fitting
     if len(agreeing) < max(settings.min_units, MIN_MAJORITY * len(b_from_rig)):
         return None
     turn = se3.mean_rotation(_turns(b_from_rig, a_from_rig)[agreeing])
@@ -187,8 +187,8 @@ def _turns(b_from_rig: Floats, a_from_rig: Floats) -> Floats:
 def _agreeing(b_from_rig: Floats, a_from_rig: Floats, i: int, j: int) -> Ints:
     """Units that lie as the similarity by units i and j says."""
     pb, pa, turns = b_from_rig[:, :3, 3], a_from_rig[:, :3, 3], _turns(b_from_rig, a_from_rig)
-    way_b, way_a = pb[j] - pb[i], pa[j] - pa[i]
-    scale = float(np.linalg.norm(way_a)) / max(float(np.linalg.norm(way_b)), 1e-9)
+    apart_b, apart_a = pb[j] - pb[i], pa[j] - pa[i]
+    scale = float(np.linalg.norm(apart_a)) / max(float(np.linalg.norm(apart_b)), 1e-9)
     off_m = np.linalg.norm(pa - pa[i] - scale * (pb - pb[i]) @ turns[i].T, axis=1)
     turned_deg = se3.rotation_angle_deg(turns @ turns[i].T)
     return np.flatnonzero((off_m <= SAME_PLACE_M) & (turned_deg <= SAME_PLACE_DEG))

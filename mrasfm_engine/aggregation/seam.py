@@ -127,7 +127,6 @@ def _relocalise(
 ) -> tuple[Relocalization, int]:
     """Look for units of b in a, a few at a time, until enough agree; and how many were looked for."""
     relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
-    image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
     parts: list[CrossMatches] = []
     found = Relocalization(
         a_from_b=None, reason="their views do not overlap", units_tried=0, units_agreeing=(), runner_up=0, inliers=0
@@ -140,7 +139,7 @@ def _relocalise(
         parts += cross.match(pairs, verified=True, cancel=cancel)
         progress(min(start + BATCH_UNITS, len(order)), len(order))
         matches = CrossMatches.joined(parts)
-        seen: Matches2D3D = matches_2d3d(a, b, matches.a, matches.b, image_of_b)
+        seen: Matches2D3D = matches_2d3d(a, b, matches.a, matches.b)
         found = relocaliser.relocalise(seen)
         if found.a_from_b is not None and len(found.units_agreeing) >= ENOUGH_AGREEING and not found.runner_up:
             return found, start + len(batch)

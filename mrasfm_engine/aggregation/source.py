@@ -86,6 +86,11 @@ class SourceScene:
         return self.image_registered & (np.diff(self.keypoint_first) > 0)
 
     @cached_property
+    def keypoint_image(self) -> Ints:
+        """(n,)."""
+        return np.repeat(np.arange(len(self.image_unit)), np.diff(self.keypoint_first))
+
+    @cached_property
     def world_from_cam(self) -> Floats:
         """Poses (i, 4, 4) of all images in the scene's frame; NaN where not registered."""
         poses = self.world_from_rig[self.image_unit]
@@ -189,9 +194,9 @@ class SourceScene:
                 update={"rig": self.manifest.rig.model_copy(update={"cameras": cameras})}
             ),
             calibration=calibration,
-            world_from_rig=_scaled(self.world_from_rig, factor),
+            world_from_rig=scaled(self.world_from_rig, factor),
             sigma_position_m=factor * self.sigma_position_m,
-            unit_from_image=_scaled(self.unit_from_image, factor),
+            unit_from_image=scaled(self.unit_from_image, factor),
             points_m=factor * self.points_m,
             footprints={},
         )
@@ -226,7 +231,7 @@ class SourceScene:
         return SourceScene(name=name, manifest=manifest, **everything)
 
 
-def _scaled(poses: Floats, factor: float) -> Floats:
+def scaled(poses: Floats, factor: float) -> Floats:
     """Poses (n, 4, 4) with their translations times a factor."""
     result = poses.copy()
     result[:, :3, 3] *= factor

@@ -58,6 +58,11 @@ class Run:
         """The matcher; its model is loaded at the first use, once."""
         return load_components(self.config, None)
 
+    @cached_property
+    def extended(self) -> dict[str, Any] | None:
+        """`map.json` of the map that is extended; None where a new one is made."""
+        return None if self.into is None else map_document(self.into)
+
     def step(self, stage: Stage) -> CountProgress:
         """The progress callback of a stage."""
         return lambda done, total: self.progress(stage, done, total)
@@ -85,7 +90,7 @@ def scenes(
     """All scenes of the map, those that it has already too; checked against one another."""
     started = time.perf_counter()
     run.begin(Stage.SCENES)
-    before = {} if run.into is None else _scenes_of_map(run.into)
+    before = {} if run.into is None or run.extended is None else _scenes_of_map(run.into, run.extended)
     for number, name in enumerate(remove):
         if not _named(name, before) or name in remove[:number]:
             what = "given to --remove twice" if name in remove[:number] else f"not in the map {run.into}"
@@ -197,8 +202,7 @@ def _tried(scene: SourceScene, seams: Sequence[Seam]) -> str:
     return listed(reasons) if reasons else "no scene is like it"
 
 
-def _scenes_of_map(folder: Path) -> dict[str, SourceScene]:
-    document = map_document(folder)
+def _scenes_of_map(folder: Path, document: Mapping[str, Any]) -> dict[str, SourceScene]:
     store, result = StageStore(folder / SCENES_FOLDER), {}
     for entry in document["scenes"]:
         found = store.load(entry["name"], entry["fingerprint"])
@@ -328,7 +332,7 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
     started = time.perf_counter()
     run.begin(Stage.ASSOCIATION)
     result = associate(found, run.config.aggregation, cancel=run.cancel)
-    result = replace(result, pairs=tuple(sorted({*result.pairs, *_pairs_with_seams(run.into, found)})))
+    result = replace(result, pairs=tuple(sorted({*result.pairs, *_pairs_with_seams(run.extended, found)})))
     middle = np.array([m[:3, 3] for m in result.map_from_scene])
     if np.nanmax(np.abs(middle - middle[result.reference])) > FAR_APART_M:
         run.found(
@@ -342,12 +346,11 @@ def association(run: Run, found: Sequence[SourceScene]) -> Association:
     return result
 
 
-def _pairs_with_seams(into: Path | None, found: Sequence[SourceScene]) -> list[tuple[int, int]]:
+def _pairs_with_seams(document: Mapping[str, Any] | None, found: Sequence[SourceScene]) -> list[tuple[int, int]]:
     """Pairs of scenes that seams of the map join already.
 
     Scenes that are added fill the lists of candidates: what rests on a seam would lose its place to them.
     """
-    document = None if into is None else map_document(into)
     if document is None:
         return []
     row = _rows_of_map(document, found)
@@ -370,7 +373,7 @@ def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> lis
     result = list(found)
     if not run.config.aggregation.agreeing_units:  # one unit alone tells no length
         return result
-    in_map = set() if run.into is None else set(_rows_of_map(map_document(run.into), found).values())
+    in_map = set() if run.extended is None else set(_rows_of_map(run.extended, found).values())
     measured = {k for k, scene in enumerate(found) if scene.is_placed or k in in_map}
     waiting = [k for k, scene in enumerate(found) if k not in measured and stated_sigma(scene)]
     if not waiting:

@@ -134,10 +134,10 @@ def initialise(mapper: Mapper, pairs: Sequence[PairMatches], prior_world_from_ri
             if method == INSIDE and points >= GOOD_START_POINTS:
                 break  # the others are for cameras that share no view; that from images alone costs most
     mapper.clear()
-    if best is None or best[0][1] < MIN_POINTS:
+    if best is None or best[1].points < MIN_POINTS:
         raise ReconstructionError(
             f"no two units of the drive have enough in common to begin: {len(pairs)} image pairs were verified, the "
-            f"best two units share {0 if best is None else best[0][1]} points",
+            f"best two units share {0 if best is None else best[1].points} points",
             remedy="Check that the images show a textured scene while the car moves, that cameras and files are not "
             "mixed up, that intrinsics fit the images, and that rig_from_cam of every camera is right.",
             code="nothing-matches",

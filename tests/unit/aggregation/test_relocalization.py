@@ -163,8 +163,7 @@ def test_a_pair_of_keypoint_and_point_counts_once(two: tuple[Driven, Driven]) ->
     point = int(np.bincount(a.keypoint_point[a.keypoint_point >= 0]).argmax())
     rows_a = np.flatnonzero(a.keypoint_point == point)
     row_b = int(b.keypoints_with_points(0)[0])
-    image_of_b = np.repeat(np.arange(len(b.image_unit)), np.diff(b.keypoint_first))
-    found = matches_2d3d(a, b, rows_a, np.full(len(rows_a), row_b), image_of_b)
+    found = matches_2d3d(a, b, rows_a, np.full(len(rows_a), row_b))
     assert len(rows_a) > 1
     assert found.unit.tolist() == [b.image_unit[0]]
     np.testing.assert_array_equal(found.points_m, a.points_m[[point]])
