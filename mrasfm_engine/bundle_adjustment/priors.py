@@ -286,33 +286,38 @@ class TimePrior:
 
 @dataclass(frozen=True, kw_only=True)
 class ScalePrior:
-    """Prior of the scale by given rotations of the cameras: the residual is their corrections' effect on it over sigma.
+    """Keeps the scale where it is best known, by what the cameras' corrections from given rotations do to it.
 
     All else about the rotations is left to other terms.
     """
 
     rotation: Floats  # (c, 3, 3) rig_from_cam, given
     scale_by_rotation: Floats  # (c, 3) derivative of the logarithm of the scale by their corrections, in rig axes
+    log_scale: float  # that they should come to: 0 with the rotations as given
     sigma: float
     sigma_scale: float  # of the scale, by both these rotations and lens models
 
-    def _residual(self, state: State) -> tuple[float, Floats]:
+    def log_scale_of(self, state: State) -> float:
+        """Logarithm of the scale that the corrections come to."""
+        return self._log_scale_and_turns(state)[0]
+
+    def _log_scale_and_turns(self, state: State) -> tuple[float, Floats]:
         turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
-        jacobian: Floats = (self.scale_by_rotation[:, None] @ se3.inverse_left_jacobian(turn))[:, 0] / self.sigma
-        return float((self.scale_by_rotation * turn).sum() / self.sigma), jacobian
+        return float((self.scale_by_rotation * turn).sum()), turn
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        return 0.5 * self._residual(state)[0] ** 2
+        return 0.5 * ((self.log_scale_of(state) - self.log_scale) / self.sigma) ** 2
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        residual, jacobian = self._residual(state)
+        log_scale, turn = self._log_scale_and_turns(state)
+        jacobian = (self.scale_by_rotation[:, None] @ se3.inverse_left_jacobian(turn))[:, 0] / self.sigma
         free = np.flatnonzero(layout.camera_slot >= 0)
         rows = ((layout.camera_dof * layout.camera_slot[free])[:, None] + np.arange(3)).ravel()
         row = jacobian[free].ravel()
         extra.cameras[np.ix_(rows, rows)] += np.outer(row, row)
-        extra.camera_gradient[rows] += residual * row
+        extra.camera_gradient[rows] += (log_scale - self.log_scale) / self.sigma * row
 
 
 @dataclass(frozen=True, kw_only=True)

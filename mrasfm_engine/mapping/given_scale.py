@@ -11,15 +11,17 @@ With x the corrections of the cameras' rotations and l the errors of the lens mo
 
 Both are estimates of one scale, and it is best known by their mean with the weights of their variances. How far the
 drive moves cameras in other directions says how good the given rotations are. Every other direction of the calibration
-stays free: one residual a'x on the rotations is added, whose sigma gives it the weight that it has against the images
-as these are weighed by the adjustment.
+stays free: one residual a'x on the rotations is added, which asks for what the mean comes to. It does not ask for the
+rotations as given, with less weight: far from there the images' robust loss tears, and a scene shrinks without end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from scipy.special import expit, gammaln
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import scale_functional
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, ScalePrior, Term
@@ -34,7 +36,9 @@ LENS_SIGMA_PX = 0.5  # RMS over an image of what each parameter of a lens model 
 # Rotations are means over whole images of what lens models leave: about as many independent errors as parameters.
 PATTERNS = 10
 ROTATION_SIGMA_PX = LENS_SIGMA_PX / np.sqrt(PATTERNS)
+MEASURED_RANGE = 100.0  # the largest errors of rotations that no calibration found, over those of one
 CONTRADICTED_SIGMAS = 3.0
+LEAST_SHARE = 0.1  # in the mean: with less it changes little, but would hold images that have not found their scale
 RIDGE = 1e-9
 
 
@@ -84,18 +88,26 @@ def scale_of_given_rotations(
     of_free = float(np.linalg.norm(by_lens * lens.ravel()))
     along = np.zeros(int(of_rig.sum()))
     along[of_rotation[of_rig]] = by_rotation.ravel()
-    as_weighed = float(along @ np.linalg.solve(known[np.ix_(of_rig, of_rig)], along))
+    as_weighed = np.sqrt(float(along @ np.linalg.solve(known[np.ix_(of_rig, of_rig)], along)))
     if not (of_given > 0.0 and of_free > 0.0 and as_weighed > 0.0):
         return None
-    # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
-    off = float((by_px * moved_px).sum()) / np.hypot(of_given, of_free)
-    share = 1.0 / (1.0 + (off / CONTRADICTED_SIGMAS) ** 2)
-    return ScalePrior(
+    result = ScalePrior(
         rotation=mapper.rig_as_begun[:, :3, :3],
         scale_by_rotation=by_rotation,
-        sigma=float(np.sqrt(as_weighed) * of_given / of_free / share),
+        log_scale=0.0,
+        sigma=np.inf,
         sigma_scale=1.0 / float(np.hypot(1.0 / of_given, 1.0 / of_free)),
     )
+    found = result.log_scale_of(mapper.state)
+    # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
+    trusted = 1.0 / (1.0 + (found / np.hypot(of_given, of_free) / CONTRADICTED_SIGMAS) ** 2)
+    ratio2 = (of_given / of_free / trusted) ** 2  # of their variances
+    share = 1.0 / (1.0 + ratio2)
+    if share < LEAST_SHARE:
+        return replace(result, log_scale=found)
+    # Images pull back with their own weight. Those that hardly resist go no farther than twice the way.
+    pull = min(ratio2, 1.0)
+    return replace(result, log_scale=found * (1.0 - share * (1.0 + pull)), sigma=as_weighed * float(np.sqrt(pull)))
 
 
 def _moved_px(mapper: Mapper) -> Floats:
@@ -116,12 +128,25 @@ def turned_px(mapper: Mapper) -> float:
 def _rotation_sigma_px(moved_px: Floats, by_rotation: Floats) -> float:
     """Standard deviation of the given rotations by how far the drive turns them (c, 3) otherwise than along one way.
 
-    As many independent errors as a lens model has parameters say what is usual, before the drive says anything.
+    Either a calibration found them, and they err by what is usual, which as many independent errors tell as a lens
+    model has parameters; or somebody measured them, and they err by any size up to `MEASURED_RANGE` times as much, each
+    as probable. Both are as probable before the drive says anything.
     """
     along = by_rotation / max(float(np.linalg.norm(by_rotation)), 1e-30)
     other = moved_px - along * (along * moved_px).sum()
-    counted = max(3 * (len(moved_px) - 1) - 1, 0)
-    return float(np.sqrt((PATTERNS * ROTATION_SIGMA_PX**2 + (other**2).sum()) / (PATTERNS + counted)))
+    counted = max(3 * (len(moved_px) - 1) - 1, 1)
+    usual2, found2 = ROTATION_SIGMA_PX**2, float((other**2).sum())
+    measured2 = max(found2 / counted, usual2)
+    # Logarithms of how probable it is to find that, without what both have in common.
+    if_calibrated = (
+        gammaln((PATTERNS + counted) / 2)
+        - gammaln(PATTERNS / 2)
+        - counted / 2 * np.log(PATTERNS * usual2)
+        - (PATTERNS + counted) / 2 * np.log1p(found2 / (PATTERNS * usual2))
+    )
+    if_measured = gammaln(counted / 2) - counted / 2 * np.log(counted * measured2) - np.log(2 * np.log(MEASURED_RANGE))
+    calibrated2 = (PATTERNS * usual2 + found2) / (PATTERNS + counted)
+    return float(np.sqrt(measured2 + expit(if_calibrated - if_measured) * (calibrated2 - measured2)))
 
 
 def _lens_sigmas(mapper: Mapper) -> Floats:

@@ -147,14 +147,6 @@ def _decide_what_varies(
     if result.times_vary and result.absolute.positions is not None:
         result.mean_time_varies = positions_may_tell_time(mapper, result.absolute.positions)
         result.absolute.clock_varies = result.mean_time_varies
-    if result.calibration.free and not result.georeferenced and not few and _reassesses(mapper):
-        result.given_scale = scale_of_given_rotations(
-            mapper,
-            free_units=free_units,
-            free_times=result.recalibrated if result.times_vary else None,
-            terms=terms_of(mapper, result),
-            options=solver_options(mapper, result),
-        )
     result.intrinsics = held_intrinsics(mapper)
     if not is_calibrated and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
         result.is_of_one_camera = mapper.drive.has_single_camera
@@ -182,6 +174,8 @@ def _adjust_in_rounds(
         offset_s = mapper.state.camera_time_offset_s
         _adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
         steady = _reassess(mapper, result) and offsets_are_steady(mapper, offset_s)
+        if done == 0:
+            _hear_given_rotations(mapper, result, free_units)
         _choose_observations(mapper, result, is_last=is_last)
         if mapper.registered.sum() < 2:
             raise ReconstructionError(
@@ -194,6 +188,19 @@ def _adjust_in_rounds(
         if progress is not None:
             progress(min(done, ROUNDS), ROUNDS)
     result.units_dropped = sorted(set(result.units_dropped))
+
+
+def _hear_given_rotations(mapper: Mapper, result: Refinement, free_units: Bools) -> None:
+    """Let the rotations as given have their say on the scale that images have found by themselves."""
+    if not result.calibration.free or result.georeferenced or not _reassesses(mapper) or has_few_units(mapper):
+        return
+    result.given_scale = scale_of_given_rotations(
+        mapper,
+        free_units=free_units & mapper.registered,
+        free_times=result.recalibrated if result.times_vary else None,
+        terms=terms_of(mapper, result),
+        options=solver_options(mapper, result),
+    )
 
 
 def _weigh_shared_errors(mapper: Mapper, result: Refinement) -> None:

@@ -12,9 +12,10 @@ from typing import Any
 from scipy.spatial.transform import Rotation
 
 from tests.benchmarks.commands import CommandFailed, evaluate, mrasfm, read_report
+from tests.benchmarks.edited_drives import Edit
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.table import Figure, exactly
-from tests.benchmarks.wrong_manifests import Edit, edited, rmse
+from tests.benchmarks.wrong_manifests import edited, rmse
 
 METRES_A_DEGREE = 111_320.0
 LATE = "image_1"

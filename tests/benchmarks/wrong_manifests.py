@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ import numpy as np
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
-from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Floats
 from schemas import Pose
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
+from tests.benchmarks.edited_drives import Edit, turned
 from tests.benchmarks.positions import Receiver
 from tests.benchmarks.real_drives import imported
 from tests.benchmarks.recalibration import AS_DECLARED
@@ -27,8 +28,6 @@ FOCAL, SIGMA_FOCAL = 1.01, 0.02
 TURNING = ("--cameras", 6, "--units", 40, "--seed", 1, "--width", 640, "--height", 360)
 RTK = Receiver(white_m=0.02, declared_m=0.02)
 ARM_M = np.array([0.5, 0.1, 1.5])
-
-Edit = Callable[[dict[str, Any]], None]
 
 
 def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
@@ -42,12 +41,12 @@ def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
         ("yawed by 10 deg", (0.0, 10.0, 0.0), 0.40),
         ("rolled by 12 deg", (0.0, 0.0, 12.0), 0.40),
     ):
-        turned = _turned(turn_deg)
+        turn = turned(TURNED, turn_deg)
         title = f"kitti06, a camera {what}"
         for receiver, edits, options, most_m in (
-            ("without GNSS", [turned], ("--no-gnss",), without_gnss_m),
-            ("GNSS", [turned], (), 0.04),
-            ("RTK of 2 cm", [turned, rtk], (), 0.04),
+            ("without GNSS", [turn], ("--no-gnss",), without_gnss_m),
+            ("GNSS", [turn], (), 0.04),
+            ("RTK of 2 cm", [turn, rtk], (), 0.04),
         ):
             scene = _reconstructed(drive, work / f"{title}, {receiver}", edits, *options)
             errors = evaluate(scene, drive)
@@ -107,18 +106,6 @@ def _reconstructed(drive: Path, out: Path, edits: Sequence[Edit], *options: obje
     """The scene of a copy of the drive whose manifest is edited."""
     mrasfm("reconstruct", edited(drive, out.with_name(out.name + ", drive"), edits), "--out", out, *options)
     return out
-
-
-def _turned(by_deg: tuple[float, float, float]) -> Edit:
-    """A camera is given turned by a rotation vector in its own axes: pitch, yaw, roll."""
-
-    def edit(manifest: dict[str, Any]) -> None:
-        camera = manifest["rig"]["cameras"][TURNED]
-        pose = matrix_from_pose(Pose(**camera["rig_from_cam"]))
-        pose[:3, :3] = pose[:3, :3] @ se3.exp_so3(np.radians(by_deg))
-        camera["rig_from_cam"] = pose_from_matrix(pose).model_dump()
-
-    return edit
 
 
 def _long_focal_lengths(manifest: dict[str, Any]) -> None:

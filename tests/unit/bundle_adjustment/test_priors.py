@@ -171,13 +171,17 @@ def test_scale_prior_asks_for_one_combination_of_rotations() -> None:
     rng = np.random.default_rng(0)
     cameras = len(case.truth.camera_rotation)
     prior = ScalePrior(
-        rotation=case.truth.camera_rotation, scale_by_rotation=rng.normal(size=(cameras, 3)), sigma=0.01,
+        rotation=case.truth.camera_rotation, scale_by_rotation=rng.normal(size=(cameras, 3)), log_scale=0.0, sigma=0.01,
         sigma_scale=0.01,
     )  # fmt: skip
     h = check_gradient(prior, case, state)
     assert np.linalg.matrix_rank(h) == 1
     assert prior.cost(state) > 0.01
     assert prior.cost(case.truth) == pytest.approx(0.0, abs=1e-20)
+    there = replace(prior, log_scale=prior.log_scale_of(state))
+    check_gradient(there, case, case.truth)
+    assert there.cost(state) == pytest.approx(0.0, abs=1e-20)
+    assert there.cost(case.truth) == pytest.approx(prior.cost(state))
 
 
 def test_rotation_prior() -> None:

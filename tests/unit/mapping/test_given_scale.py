@@ -1,16 +1,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mrasfm_engine.bundle_adjustment.priors import ScalePrior
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.mapping import given_scale, refinement
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
+from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import scale_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement, solver_options
@@ -83,7 +86,7 @@ def rms(values: list[float]) -> float:
 @pytest.mark.slow
 def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
     """Errors of lens models and of rotations show in no residual."""
-    drives = [drive(seed) for seed in range(8)]
+    drives = [drive(seed) for seed in range(24)]
     both, sigmas = [], []
     for one in drives:
         error, result = refined(one)
@@ -118,14 +121,55 @@ def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share
     assert options.loss_scale * options.sigma_px == pytest.approx(in_px)
 
 
-def test_rotations_that_images_contradict_say_nothing_of_the_scale() -> None:
-    weights = []
-    for off_px in (0.2, 30.0):
-        error, result = refined(drive(1, lens_px=0.0, turned_px=off_px))
-        assert result.given_scale is not None
-        assert abs(error) < 0.02
-        weights.append(1.0 / result.given_scale.sigma)
-    assert 0 < weights[1] < 0.2 * weights[0]
+@pytest.mark.parametrize(("off_px", "least", "most"), [(0.2, 0.5, 1.001), (30.0, 0.0, 0.001)])
+def test_rotations_that_images_contradict_say_nothing_of_the_scale(
+    off_px: float, least: float, most: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts of the way to them that the scale is asked to go."""
+    asked = []
+
+    def hear(mapper: Mapper, **arguments: Any) -> ScalePrior | None:
+        prior = given_scale.scale_of_given_rotations(mapper, **arguments)
+        assert prior is not None
+        asked.append(1.0 - prior.log_scale / prior.log_scale_of(mapper.state))
+        return prior
+
+    monkeypatch.setattr(refinement, "scale_of_given_rotations", hear)
+    error, _ = refined(drive(1, lens_px=0.0, turned_px=off_px))
+    assert abs(error) < 0.02
+    assert len(asked) == 1
+    assert least <= asked[0] < most
+
+
+@pytest.mark.parametrize(("off_px", "least", "most"), [(0.1, 0.5, 1.5), (3.0, 0.8, 1.25), (30.0, 0.8, 1.25)])
+def test_a_drive_tells_how_well_rotations_are_known(off_px: float, least: float, most: float) -> None:
+    """Of calibrations it is known what they err by, of rigs that were measured by hand it is not."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(200):
+        moved_px = rng.normal(scale=off_px, size=(4, 3))
+        found.append(given_scale._rotation_sigma_px(moved_px - moved_px.mean(axis=0), rng.normal(size=(4, 3))))
+    assert least < np.median(found) / max(off_px, ROTATION_SIGMA_PX) < most
+
+
+def test_given_rotations_are_asked_once_images_have_found_the_scale(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before that, derivatives are those of another scene: the scale would be pulled where nobody wants it."""
+    done = []
+    adjust = refinement._adjust
+
+    def adjusted(*values: Any, **arguments: Any) -> None:
+        done.append("adjusted")
+        adjust(*values, **arguments)
+
+    def heard(mapper: Mapper, **arguments: Any) -> ScalePrior | None:
+        done.append("heard")
+        return given_scale.scale_of_given_rotations(mapper, **arguments)
+
+    monkeypatch.setattr(refinement, "_adjust", adjusted)
+    monkeypatch.setattr(refinement, "scale_of_given_rotations", heard)
+    refined(drive(1))
+    assert done[:3] == ["adjusted", "heard", "adjusted"]
+    assert done.count("heard") == 1
 
 
 def test_a_scale_that_the_drive_hardly_observes_is_a_finding() -> None:
