@@ -208,7 +208,7 @@ def _weigh_shared_errors(mapper: Mapper, result: Refinement) -> None:
 
     The residual on given rotations keeps its share against the images.
     """
-    if not result.recalibrated.any() or has_few_units(mapper):
+    if not result.recalibrated.any():
         return
     certainty = certainty_of(mapper, result)
     if certainty is None:

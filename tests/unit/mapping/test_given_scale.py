@@ -12,6 +12,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.mapping import given_scale, refinement
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import scale_findings
@@ -24,6 +25,7 @@ from tests.helpers.simulated_drive import (
     with_cameras,
     with_true_poses,
 )
+from tests.unit.mapping.test_placement import ARM_M, received
 
 UNITS = 20
 
@@ -45,10 +47,11 @@ def drive(
     *,
     lens_px: float = LENS_SIGMA_PX,
     turned_px: float = ROTATION_SIGMA_PX,
+    units: int = UNITS,
 ) -> SimulatedDrive:
     """A straight street and two cameras whose lens models and rotations are off by what calibrations leave."""
     rng = np.random.default_rng([seed, 1])
-    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500, straight=True, noise_px=0.2, seed=seed)
+    simulated = make_simulated_drive(units=units, cameras=2, points=1500, straight=True, noise_px=0.2, seed=seed)
     focal_px = float(simulated.truth.camera_params[0, 0])
 
     features, sizes = [], rng.normal(size=(2, 6))
@@ -75,8 +78,11 @@ def refined(simulated: SimulatedDrive, *, free: bool = True) -> tuple[float, Ref
         range(len(simulated.world_from_rig)),
     )
     result = refine(mapper)
-    found = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3])
-    return float(np.log(found.scale)), result
+    return log_scale_error(mapper, simulated), result
+
+
+def log_scale_error(mapper: Mapper, simulated: SimulatedDrive) -> float:
+    return float(np.log(align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale))
 
 
 def rms(values: list[float]) -> float:
@@ -119,6 +125,16 @@ def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share
     assert options.sigma_px == pytest.approx(result.sigma_px * result.sigma_factor)
     in_px = mapper.config.bundle_adjustment.loss_scale * result.sigma_px
     assert options.loss_scale * options.sigma_px == pytest.approx(in_px)
+
+
+def test_images_of_a_short_drive_weigh_less_beside_a_receiver_too() -> None:
+    """Eight units tell as well as many that their observations share errors."""
+    simulated = drive(1, units=8)
+    mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(8))
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.02), antenna_in_rig_m=ARM_M))
+    assert result.georeferenced
+    assert 1.2 < result.sigma_factor < 5.0
+    assert 1e-5 < abs(log_scale_error(mapper, simulated)) < 1e-3
 
 
 @pytest.mark.parametrize(("off_px", "least", "most"), [(0.2, 0.5, 1.001), (30.0, 0.0, 0.001)])
