@@ -91,23 +91,28 @@ def scale_of_given_rotations(
     as_weighed = np.sqrt(float(along @ np.linalg.solve(known[np.ix_(of_rig, of_rig)], along)))
     if not (of_given > 0.0 and of_free > 0.0 and as_weighed > 0.0):
         return None
-    result = ScalePrior(
+    images_alone = ScalePrior(
         rotation=mapper.rig_as_begun[:, :3, :3],
         scale_by_rotation=by_rotation,
         log_scale=0.0,
         sigma=np.inf,
-        sigma_scale=1.0 / float(np.hypot(1.0 / of_given, 1.0 / of_free)),
+        sigma_scale=of_free,
     )
-    found = result.log_scale_of(mapper.state)
+    found = images_alone.log_scale_of(mapper.state)
     # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
     trusted = 1.0 / (1.0 + (found / np.hypot(of_given, of_free) / CONTRADICTED_SIGMAS) ** 2)
     ratio2 = (of_given / of_free / trusted) ** 2  # of their variances
     share = 1.0 / (1.0 + ratio2)
     if share < LEAST_SHARE:
-        return replace(result, log_scale=found)
+        return images_alone
     # Images pull back with their own weight. Those that hardly resist go no farther than twice the way.
     pull = min(ratio2, 1.0)
-    return replace(result, log_scale=found * (1.0 - share * (1.0 + pull)), sigma=as_weighed * float(np.sqrt(pull)))
+    return replace(
+        images_alone,
+        log_scale=found * (1.0 - share * (1.0 + pull)),
+        sigma=as_weighed * float(np.sqrt(pull)),
+        sigma_scale=float(np.hypot(share * of_given, (1.0 - share) * of_free)),
+    )
 
 
 def _moved_px(mapper: Mapper) -> Floats:
