@@ -128,7 +128,7 @@ def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel
 def _decide_what_varies(
     mapper: Mapper, result: Refinement, free_units: Bools, *, is_calibrated: bool, cancel: Cancel | None
 ) -> None:
-    """Decide which of calibration, time offsets and intrinsics vary, and what else says the scale."""
+    """Decide which of calibration, time offsets and intrinsics vary."""
     if is_calibrated:
         result.calibration = CalibrationDecision(False, OF_THE_LARGEST)
     else:
@@ -140,8 +140,7 @@ def _decide_what_varies(
             options=solver_options(mapper, result),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    few = not result.georeferenced and _reassesses(mapper) and has_few_units(mapper)
-    if result.calibration.free and few:
+    if result.calibration.free and not result.georeferenced and _reassesses(mapper) and has_few_units(mapper):
         _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
     if result.times_vary and result.absolute.positions is not None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from mrasfm_engine.types import Floats
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.edited_drives import Edit, edited_drive, turned
 from tests.benchmarks.positions import Receiver
-from tests.benchmarks.real_drives import DRIVES, imported
+from tests.benchmarks.real_drives import DRIVES, RealDrive, imported
 from tests.benchmarks.table import Figure, exactly
 
 SEEDS = 5
@@ -49,8 +50,7 @@ def receivers(data: Path, work: Path) -> Iterator[Figure]:
 
 def _wandering(data: Path, work: Path) -> Iterator[Figure]:
     """PandaSet with positions that scatter and wander, declared so."""
-    real = next(real for real in DRIVES if real.name == "pandaset_002")
-    drive = imported(data, real.name, work, *real.options)
+    real, drive = _pandaset(data, work)
     errors = []
     for seed in range(SEEDS):
         edited = edited_drive(drive, work / f"{real.name}, receiver {seed}", _wander(drive, seed))
@@ -133,19 +133,14 @@ def _single_camera(data: Path, work: Path) -> Iterator[Figure]:
 
 def _halves(data: Path, work: Path) -> Iterator[Figure]:
     """PandaSet by either half of its cameras, without GNSS: both know its size, and find one shape, as they state."""
-    real = next(real for real in DRIVES if real.name == "pandaset_002")
-    drive = imported(data, real.name, work, *real.options)
+    real, drive = _pandaset(data, work)
     positions_m, sigmas_m = [], []
     for half in HALVES:
         title = f"{real.name} by {', '.join(half)}, without GNSS"
-        edited = edited_drive(drive, work / title, _without([c for c in _cameras(drive) if c not in half]))
-        scene = edited.with_name(edited.name + ", scene")
-        mrasfm("reconstruct", edited, "--out", scene, "--no-gnss")
-        found = evaluate(scene, edited)
+        leave = _without([c for c in _cameras(drive) if c not in half])
+        scene, found = _without_gnss(edited_drive(drive, work / title, leave))
         yield exactly("21", f"{title}: images registered", found["registered_images"], real.images // 2)
-        similarity_m = found["similarity"]["rmse_m"]
-        yield Figure(line="21", what=f"{title}: similarity RMSE", value=similarity_m, unit="m", most=0.010)
-        yield _error_of_scale(title, scene, found)
+        yield from _shape_and_scale(title, scene, found)
         known = [u for u in read_json(scene / "poses.json")["units"] if "sigma_position_m" in u]
         positions_m.append(np.array([u["world_from_rig"]["translation_m"] for u in known]))
         sigmas_m.append(np.array([u["sigma_position_m"] for u in known]))
@@ -168,33 +163,34 @@ def _halves(data: Path, work: Path) -> Iterator[Figure]:
 
 def _turned_pair(data: Path, work: Path) -> Iterator[Figure]:
     """Two of PandaSet's cameras that see next to nothing in common, given turned against one another, without GNSS."""
-    real = next(real for real in DRIVES if real.name == "pandaset_002")
-    drive = imported(data, real.name, work, *real.options)
+    real, drive = _pandaset(data, work)
     pair = ("front_camera", "front_left_camera")
     for number, turns_deg in enumerate(TURNS_DEG):
         title = f"{real.name} by {', '.join(pair)}, turned {number}, without GNSS"
+        turns = (turned(camera, by_deg) for camera, by_deg in enumerate(turns_deg))
         leave = _without([c for c in _cameras(drive) if c not in pair])
-
-        def edit(
-            manifest: dict[str, Any], leave: Edit = leave, turns_deg: Sequence[tuple[float, float, float]] = turns_deg
-        ) -> None:
-            leave(manifest)
-            for camera, by_deg in enumerate(turns_deg):
-                turned(camera, by_deg)(manifest)
-
-        edited = edited_drive(drive, work / title, edit)
-        scene = edited.with_name(edited.name + ", scene")
-        mrasfm("reconstruct", edited, "--out", scene, "--no-gnss")
-        found = evaluate(scene, edited)
-        similarity_m = found["similarity"]["rmse_m"]
-        yield Figure(line="21", what=f"{title}: similarity RMSE", value=similarity_m, unit="m", most=0.010)
-        yield _error_of_scale(title, scene, found)
+        scene, found = _without_gnss(edited_drive(drive, work / title, leave, *turns))
+        yield from _shape_and_scale(title, scene, found)
 
 
-def _error_of_scale(title: str, scene: Path, found: dict[str, Any]) -> Figure:
+def _pandaset(data: Path, work: Path) -> tuple[RealDrive, Path]:
+    real = next(real for real in DRIVES if real.name == "pandaset_002")
+    return real, imported(data, real.name, work, *real.options)
+
+
+def _without_gnss(drive: Path) -> tuple[Path, dict[str, Any]]:
+    """The scene, and its errors."""
+    scene = drive.with_name(drive.name + ", scene")
+    mrasfm("reconstruct", drive, "--out", scene, "--no-gnss")
+    return scene, evaluate(scene, drive)
+
+
+def _shape_and_scale(title: str, scene: Path, found: dict[str, Any]) -> Iterator[Figure]:
+    similarity, figure = found["similarity"], partial(Figure, line="21")
     sigma = read_report(scene)["by_stage"]["refinement"]["scale"]["sigma_relative"]
-    off = abs(math.log(found["similarity"]["scale"])) / sigma
-    return Figure(line="21", what=f"{title}: error of the scale in its sigmas", value=off, above=-1e-9, most=3.0)
+    off = abs(math.log(similarity["scale"])) / sigma
+    yield figure(what=f"{title}: similarity RMSE", value=similarity["rmse_m"], unit="m", most=0.010)
+    yield figure(what=f"{title}: error of the scale in its sigmas", value=off, above=-1e-9, most=3.0)
 
 
 def _rms(values: Floats) -> float:
