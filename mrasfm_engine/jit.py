@@ -2,6 +2,8 @@
 
 numba compiles a kernel anew when the file that it stands in has changed. What the kernel calls in other files, and the
 constants that it takes from them, are compiled into it: after an update of those alone it would go on as before.
+
+`uncounted` is `njit` for what kernels do with every observation.
 """
 
 from __future__ import annotations
@@ -22,11 +24,27 @@ import numba
 from numba import njit
 from numba.core import caching
 
-__all__ = ["njit", "source_files"]
+__all__ = ["njit", "source_files", "uncounted"]
 
 PACKAGE = Path(__file__).resolve().parent
 BEGUN_S = time.time()
 _IMPORT = re.compile(r"^from ((?:mrasfm_engine|schemas)[\w.]*) import (?:\(([^)]*)\)|([^\n]*))", re.MULTILINE)
+
+
+def uncounted(*, forceinline: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """`njit` without reference counts, for what kernels do with every observation.
+
+    numba counts a reference whenever code takes a row of an array, or an array out of a tuple: an atomic addition, and
+    another one when it lets go. A point's projection is 20 ns of arithmetic; counted, it takes 160. Without counts a
+    function only borrows: numba refuses to compile one that makes an array, and it must not return one that it was
+    given (a test looks). Kernels ask for their memory once, and then call such a function with it.
+
+    `_nrt` is numba's own switch for this; as it is not documented for users, it is one more reason for the pin.
+    """
+    return njit(  # type: ignore[no-any-return]
+        cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"}, _nrt=False,
+        forceinline=forceinline,
+    )  # fmt: skip
 
 
 def source_files(module: str) -> list[Path]:
@@ -81,7 +99,7 @@ def _stamp(module: str) -> str:
     of its own.
     """
     digest = hashlib.sha256()
-    for path in source_files(module):
+    for path in [Path(__file__), *source_files(module)]:  # here are the options with which all are compiled
         if path.stat().st_ctime > BEGUN_S:
             return uuid4().hex
         digest.update(f"{path.name} {len(_text(path))}\n{_text(path)}".encode())

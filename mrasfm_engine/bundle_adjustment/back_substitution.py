@@ -21,10 +21,10 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     workspace,
 )
 from mrasfm_engine.bundle_adjustment.point_elimination import multiply3
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _moved_point(
     d: Any, omega0: float, omega1: float, omega2: float, tau0: float, tau1: float, tau2: float
 ) -> tuple[float, float, float]:  # fmt: skip
@@ -36,16 +36,26 @@ def _moved_point(
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def substitute(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
     loss: Loss, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """New points lo..hi after a step of the reduced vector: X - V^-1 (e + sum of W_i' step_i)."""
+    _substitute(
+        views, bands, motion, points, observed, free_slots, loss, step, v_inverse, v_gradient, lo, hi, out,
+        workspace(6 + len(free_slots.inner)), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _substitute(
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
+    loss: Loss, step: Any, v_inverse: Any, v_gradient: Any, lo: int, hi: int, out: Any, memory: Any, e: Any,
+) -> None:  # fmt: skip
     unit_slot, camera_slot, num_units, inner_places = free_slots
     dof = 6 + len(inner_places)
-    d, rig, cam, work, proj, res, jx, jc = workspace(dof)
-    e = np.empty(3)
+    d, rig, cam, work, proj, res, jx, jc = memory
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, _ = observed
     for p in range(lo, hi):
@@ -57,8 +67,9 @@ def substitute(
             if motion is None and unit_slot[u] < 0 and sc < 0:
                 continue
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, cam_r[c], cam_t[c],
-                kind[c], params[c], points[p], obs_xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
+                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, sc >= 0,
+                cam_r[c], cam_t[c], kind[c], params[c], points[p], obs_xy[n], loss,
+                d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
             x0, x1, x2 = 0.0, 0.0, 0.0
@@ -87,28 +98,42 @@ def substitute(
         out[p, 2] = points[p, 2] - y2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def add_scores(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
     loss: Loss, columns: Any, v_inverse: Any, image: Any, most: int, lo: int, hi: int, out: Any,
 ) -> None:  # fmt: skip
     """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their images' scores."""
+    count = columns.shape[1]
+    along, normal = np.empty((2, count)), np.empty((most, 3))  # of an observation; J_point' r of each
+    _add_scores(
+        views, bands, motion, points, observed, free_slots, loss, columns, v_inverse, image, lo, hi, out,
+        workspace(6 + len(free_slots.inner)), along, normal, np.empty((3, count)), np.empty((3, count)),
+    )  # fmt: skip
+
+
+@uncounted()
+def _add_scores(
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
+    loss: Loss, columns: Any, v_inverse: Any, image: Any, lo: int, hi: int, out: Any,
+    memory: Any, along: Any, normal: Any, e: Any, shift: Any,
+) -> None:  # fmt: skip
     unit_slot, camera_slot, num_units, inner_places = free_slots
     dof, count = 6 + len(inner_places), columns.shape[1]
-    d, rig, cam, work, proj, res, jx, jc = workspace(dof)
+    d, rig, cam, work, proj, res, jx, jc = memory
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
-    along, normal = np.empty((2, count)), np.empty((most, 3))  # of an observation; J_point' r of each
-    e, shift = np.empty((3, count)), np.empty((3, count))
     for p in range(lo, hi):
         begin, end = first[p], first[p + 1]
         e[:] = 0.0
         for n in range(begin, end):
             u, c, band = obs_unit[n], obs_camera[n], row_band(bands, n)
+            sc = camera_slot[c]
             normal[n - begin] = 0.0
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, cam_r[c], cam_t[c],
-                kind[c], params[c], points[p], obs_xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
+                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, sc >= 0,
+                cam_r[c], cam_t[c], kind[c], params[c], points[p], obs_xy[n], loss,
+                d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
             shift[:] = 0.0
@@ -116,7 +141,6 @@ def add_scores(
                 slot, weight = support(motion, unit_slot, u, band, k)
                 if slot >= 0:
                     _add_moved_points(d, weight, columns, 6 * slot, shift)
-            sc = camera_slot[c]
             _residuals_along(jx, jc, shift, columns, -1 if sc < 0 else 6 * num_units + dof * sc, along)
             for k in range(count):
                 out[image[n], k] += res[0] * along[0, k] + res[1] * along[1, k]
@@ -134,7 +158,7 @@ def add_scores(
                 out[image[n], k] -= q[0] * shift[0, k] + q[1] * shift[1, k] + q[2] * shift[2, k]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _add_moved_points(d: Any, weight: float, columns: Any, o: int, shift: Any) -> None:
     """Add weight times `_moved_point` of steps (n, k), of the unit at place o, to shift (3, k)."""
     for k in range(columns.shape[1]):
@@ -147,7 +171,7 @@ def _add_moved_points(d: Any, weight: float, columns: Any, o: int, shift: Any) -
         shift[2, k] += weight * x2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _residuals_along(jx: Any, jc: Any, shift: Any, columns: Any, o: int, along: Any) -> None:
     """Change of a residual along (2, k) moves of its point and steps of its camera at place o, -1 where it is held."""
     for i in range(2):

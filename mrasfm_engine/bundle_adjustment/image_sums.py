@@ -25,7 +25,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     num_supports,
     support,
 )
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 
 UNIT_SUMS = 27  # of an image: its unit's block by its lower triangle, and gradient
 
@@ -35,26 +35,22 @@ def num_image_sums(inner: int) -> int:
     return UNIT_SUMS + 6 * inner + inner * (inner + 1) // 2 + inner
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def _inner_sums(inner: int) -> tuple[int, int]:
     """Places of the products of a camera's `inner` unknowns with one another, and of their gradient."""
     own = UNIT_SUMS + 6 * inner
     return own, own + inner * (inner + 1) // 2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def as_tuples(jx: Any, d: Any, res: Any) -> Any:
-    """Rows of N, X - t_u and the residual of an observation.
-
-    numba counts the references of arrays that a function with loops takes, which costs time for every observation;
-    tuples of numbers have none.
-    """
+@uncounted(forceinline=True)
+def as_tuples(jx: Any, d: Any, res: Any) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, ...]]:
+    """Rows of N, X - t_u and the residual of an observation."""
     rows = (jx[0, 0], jx[0, 1], jx[0, 2]), (jx[1, 0], jx[1, 1], jx[1, 2])
     return rows, (d[0], d[1], d[2]), (res[0], res[1])
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def observation_products(n_rows: Any, d: Any, r: Any) -> Any:
+@uncounted(forceinline=True)
+def observation_products(n_rows: Any, d: Any, r: Any) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]]:
     """V = N' N by its upper triangle, V [d]x row by row, and N' r of an observation."""
     (a0, a1, a2), (c0, c1, c2) = n_rows
     d0, d1, d2 = d
@@ -72,7 +68,7 @@ def observation_products(n_rows: Any, d: Any, r: Any) -> Any:
     )  # fmt: skip
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def add_unit_sums(s: Any, d: Any, v: Any, t: Any, e: Any) -> None:
     """Add an observation with the `observation_products` v, t and e to the unit's sums of its image."""
     v00, v01, v02, v11, v12, v22 = v
@@ -108,7 +104,7 @@ def add_unit_sums(s: Any, d: Any, v: Any, t: Any, e: Any) -> None:
     s[26] -= e2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def add_inner_sums(s: Any, d: Any, n_rows: Any, jc: Any, r: Any, inner_places: Any) -> None:
     """Add an observation to the sums of its image with the camera's unknowns besides its pose."""
     own, own_gradient = _inner_sums(len(inner_places))
@@ -130,7 +126,7 @@ def add_inner_sums(s: Any, d: Any, n_rows: Any, jc: Any, r: Any, inner_places: A
         s[own_gradient + k] += f0 * r0 + f1 * r1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def add_images(
     views: Views, bands: Bands | None, motion: Motion | None, image_unit: Any, image_camera: Any, image_band: Any,
     free_slots: Slots, first_row: Any, rows: Any, images: Any, s_units: Any, s_border: Any, s_cameras: Any,
@@ -145,9 +141,21 @@ def add_images(
 
     so that of all products of Jacobians only the unit's are summed over observations.
     """
+    _add_images(
+        views, bands, motion, image_unit, image_camera, image_band, free_slots, first_row, rows, images,
+        s_units, s_border, s_cameras, diagonal, g,
+        np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _add_images(
+    views: Views, bands: Bands | None, motion: Motion | None, image_unit: Any, image_camera: Any, image_band: Any,
+    free_slots: Slots, first_row: Any, rows: Any, images: Any, s_units: Any, s_border: Any, s_cameras: Any,
+    diagonal: Any, g: Any, h: Any, t: Any, th: Any, r: Any, q: Any,
+) -> None:  # fmt: skip
     unit_slot, camera_slot, num_units, inner_places = free_slots
     dof = 6 + len(inner_places)
-    h, t, th, r, q = np.empty((6, 6)), np.zeros((6, 6)), np.empty((6, 6)), np.empty((3, 3)), np.empty(3)
     for image in range(len(images)):
         u, c, band = image_unit[image], image_camera[image], image_band[image]
         s = images[image]
@@ -179,7 +187,7 @@ def add_images(
                         block[6 * i + j] += wa * wb * h[i, j]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _unit_block(s: Any, h: Any) -> None:
     """Unit's block h (6, 6) of an image's sums."""
     k = 0
@@ -189,7 +197,7 @@ def _unit_block(s: Any, h: Any) -> None:
             k += 1
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def _camera_from_unit(
     unit_r: Any, bands: Bands | None, motion: Motion | None, band: int, cam_t: Any, r: Any, q: Any, t: Any
 ) -> None:
@@ -219,7 +227,7 @@ def _camera_from_unit(
         t[5, j] = q[0] * r[1, j] - q[1] * r[0, j]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _multiply_transposed(t: Any, h: Any, th: Any) -> None:
     """T' H of 6x6 matrices."""
     for i in range(6):
@@ -230,7 +238,7 @@ def _multiply_transposed(t: Any, h: Any, th: Any) -> None:
             th[i, j] = x
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _add_camera(s: Any, t: Any, th: Any, inner_places: Any, square: Any, o: int, diagonal: Any, g: Any) -> None:
     """Add an image to its camera's block with itself, and to the diagonal and gradient from the camera's first place o.
 
@@ -263,7 +271,7 @@ def _add_camera(s: Any, t: Any, th: Any, inner_places: Any, square: Any, o: int,
         diagonal[o + 6 + f] += s[own + f * (f + 1) // 2 + f]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _add_border(s: Any, th: Any, weight: float, inner_places: Any, border: Any) -> None:
     """Add an image to the block of its camera with a unit that moves it by a weight."""
     for j in range(6):

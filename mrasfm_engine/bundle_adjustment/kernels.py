@@ -29,9 +29,7 @@ Small functions of the inner loops are `forceinline`: LLVM puts them into their 
 would copy their code before it infers types, and compile every copy anew, which takes several times as long. Constants
 among a kernel's arguments are wrapped (`np.bool_(False)`): a literal is a type of its own, and compiled for itself.
 
-Kernels unpack their named tuples once and call `linearise` themselves: a function between them, inlined or not, counts
-the references of its arrays again for every observation. Without row bands that makes `back_substitution.substitute`
-slower by 20 % and more.
+What runs for every observation counts no references (`uncounted`): kernels ask for their memory and hand it on.
 """
 
 from __future__ import annotations
@@ -42,7 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mrasfm_engine.geometry.camera_model import inverse_depth, project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Floats, Ints
 
 BEHIND_PX = 1000.0  # what an observation costs whose point is where its camera shows nothing
@@ -116,7 +114,7 @@ class Loss(NamedTuple):
     is_curved: bool
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def camera_point(
     unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, cam_r: Any, cam_t: Any, x: Any,
     from_unit: Any, rig: Any, cam: Any,
@@ -144,12 +142,21 @@ def camera_point(
         cam[i] = cam_r[0, i] * rig[0] + cam_r[1, i] * rig[1] + cam_r[2, i] * rig[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def squared_errors(
     views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any
 ) -> None:
     """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared of points not seen."""
-    d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
+    _squared_errors(
+        views, bands, points, observed, lo, hi, out, np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
+    )
+
+
+@uncounted()
+def _squared_errors(
+    views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any,
+    d: Any, rig: Any, cam: Any, work: Any, proj: Any,
+) -> None:  # fmt: skip
     for n in range(lo, hi):
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
@@ -163,15 +170,16 @@ def squared_errors(
         out[n] = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def linearise(
-    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, c: int, cam_r: Any, cam_t: Any,
-    kind: int, k: Any, x: Any, xy: Any, loss: Loss,
+    unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, c: int, camera_is_free: bool,
+    cam_r: Any, cam_t: Any, kind: int, k: Any, x: Any, xy: Any, loss: Loss,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any,
 ) -> bool:  # fmt: skip
-    """Weighted residual, and its derivatives in the point and the camera, of one observation; False if it is not seen.
+    """Weighted residual, and its derivatives in the point and a free camera, of one observation; False if it is not
+    seen.
 
-    Those in the unit follow from jx = N and d = X - t_u.
+    Those in the unit follow from jx = N and d = X - t_u. Of a camera that is not free there are none.
     """
     camera_point(unit_r, unit_t, bands, band, follows, cam_r, cam_t, x, d, rig, cam)
     if not project(kind, k, cam[0], cam[1], cam[2], work, proj):
@@ -200,6 +208,8 @@ def linearise(
         n1 = q0 * unit_r[1, 0] + q1 * unit_r[1, 1] + q2 * unit_r[1, 2]
         n2 = q0 * unit_r[2, 0] + q1 * unit_r[2, 1] + q2 * unit_r[2, 2]
         jx[i, 0], jx[i, 1], jx[i, 2] = n0, n1, n2
+        if not camera_is_free:
+            continue
         jc[i, 0], jc[i, 1], jc[i, 2] = m1 * rig[2] - m2 * rig[1], m2 * rig[0] - m0 * rig[2], m0 * rig[1] - m1 * rig[0]
         jc[i, 3], jc[i, 4], jc[i, 5] = -m0, -m1, -m2
         jc[i, 6] = (proj[i] - k[2 + i]) * s
@@ -217,37 +227,37 @@ def linearise(
                 jc[i, 8] = jc[i, 7] * (
                     bands.readout[c, 0] * xy[0] + bands.readout[c, 1] * xy[1] + bands.readout[c, 2] - 0.5
                 )
-    if jc.shape[1] > 9:
+    if camera_is_free and jc.shape[1] > 9:
         intrinsics_derivatives(kind, k, cam, proj, s, jc)
     return True
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True)
 def workspace(dof: int) -> Any:
     """Arrays d, rig, cam, work, proj, res, jx and jc for `linearise`, of a camera with `dof` unknowns."""
     d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
     return d, rig, cam, work, proj, res, np.empty((2, 3)), np.empty((2, dof))
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def row_band(bands: Any, n: int) -> int:
     """Row band of an observation; 0 where there are none."""
     return 0 if bands is None else bands.of_observation[n]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def follows_trajectory(motion: Any, band: int) -> Any:
+@uncounted(forceinline=True)
+def follows_trajectory(motion: Any, band: int) -> bool:
     """True if steps of several units move a row band, False if it is held to its own."""
-    return np.bool_(False) if motion is None else motion.weight[band, 0] != 1.0
+    return bool(motion is not None and motion.weight[band, 0] != 1.0)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def num_supports(motion: Any) -> int:
     """Number of units whose steps may move an observation: its own, or the support of its row band."""
     return 1 if motion is None else 3
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def support(motion: Any, unit_slot: Any, u: int, band: int, k: int) -> tuple[int, float]:
     """Slot, -1 where held, and weight of unit k of those whose steps move an observation by unit u."""
     if motion is None:
@@ -257,7 +267,7 @@ def support(motion: Any, unit_slot: Any, u: int, band: int, k: int) -> tuple[int
     return (-1 if weight == 0.0 else slot), weight
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def intrinsics_derivatives(kind: int, k: Any, cam: Any, proj: Any, s: float, jc: Any) -> None:
     """Derivatives, times s, of a pixel in log(fy / fx), cx, cy and the four terms of distortion into jc[:, 9:16].
 

@@ -32,7 +32,7 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     workspace,
 )
 from mrasfm_engine.bundle_adjustment.schur_structure import Groups
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Floats
 
 
@@ -48,7 +48,7 @@ class Sums(NamedTuple):
     v_gradient: Floats
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def _most_blocks(first_block: Any) -> int:
     """Largest number of blocks that a group couples."""
     most = 0
@@ -57,7 +57,7 @@ def _most_blocks(first_block: Any) -> int:
     return most
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def _find(blocks: Any, begin: int, end: int, block: int) -> int:
     """Index of a block in blocks[begin:end], counted from begin; -1 where it is not there."""
     for i in range(begin, end):
@@ -66,7 +66,7 @@ def _find(blocks: Any, begin: int, end: int, block: int) -> int:
     return -1
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def invert3(v: Any, out: Any) -> bool:
     """Inverse of a symmetric 3x3 matrix [00, 01, 02, 11, 12, 22]; False where it is singular."""
     c0, c1, c2 = v[3] * v[5] - v[4] * v[4], v[2] * v[4] - v[1] * v[5], v[1] * v[4] - v[2] * v[3]
@@ -83,7 +83,7 @@ def invert3(v: Any, out: Any) -> bool:
     return True
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def multiply3(m: Any, x0: float, x1: float, x2: float) -> tuple[float, float, float]:
     """Product of a symmetric 3x3 matrix, kept as that of `invert3`, with a vector."""
     return (
@@ -93,7 +93,7 @@ def multiply3(m: Any, x0: float, x1: float, x2: float) -> tuple[float, float, fl
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def accumulate(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
     free_slots: Slots, groups: Groups, loss: Loss, damping: float, lo: int, hi: int, sums: Sums,
@@ -105,18 +105,30 @@ def accumulate(
     cameras, d^2) of the cameras, where d are a camera's unknowns; of all three the lower blocks, and from the gradient
     (n,). Every point's V^-1 (p, 6) and gradient (p, 3) are kept.
     """
+    dof = 6 + len(free_slots.inner)
+    most = _most_blocks(groups.first_block)
+    w = np.empty((most, 3, dof))  # coupling of a point to its blocks, transposed
+    # W_j and W_i V^-1, spread over blocks' entries
+    tiled, repeated = np.empty((most, 3 * 6 * dof)), np.empty(3 * 6 * dof)
+    _accumulate(
+        views, bands, motion, points, observed, obs_image, free_slots, groups, loss, damping, lo, hi, sums,
+        workspace(dof), np.empty(6), np.empty(6), np.empty(3), w, tiled, repeated,
+    )  # fmt: skip
+
+
+@uncounted()
+def _accumulate(
+    views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
+    free_slots: Slots, groups: Groups, loss: Loss, damping: float, lo: int, hi: int, sums: Sums,
+    memory: Any, v: Any, inv: Any, e: Any, w: Any, tiled: Any, repeated: Any,
+) -> None:  # fmt: skip
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
     unit_slot, camera_slot, num_units, inner_places = free_slots
     dof = 6 + len(inner_places)
     order, first_point, blocks, first_block, places, first_place = groups
     images, s_units, s_border, s_cameras, g, v_inverse, v_gradient = sums
-    d, rig, cam, work, proj, res, jx, jc = workspace(dof)
-    v, inv, e = np.empty(6), np.empty(6), np.empty(3)
-    most = _most_blocks(first_block)
-    w = np.empty((most, 3, dof))  # coupling of a point to its blocks, transposed
-    # W_j and W_i V^-1, spread over blocks' entries
-    tiled, repeated = np.empty((most, 3 * 6 * dof)), np.empty(3 * 6 * dof)
+    d, rig, cam, work, proj, res, jx, jc = memory
     group = np.searchsorted(first_point, lo, side="right") - 1
     for index in range(lo, hi):
         while index >= first_point[group + 1]:
@@ -128,9 +140,11 @@ def accumulate(
         w[: b1 - b0] = 0.0
         for n in range(first[p], first[p + 1]):
             u, c, band = obs_unit[n], obs_camera[n], row_band(bands, n)
+            slot_of_camera = camera_slot[c]
             if not linearise(
-                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, cam_r[c], cam_t[c],
-                kind[c], params[c], points[p], obs_xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
+                unit_r[u], unit_t[u], bands, band, follows_trajectory(motion, band), c, slot_of_camera >= 0,
+                cam_r[c], cam_t[c], kind[c], params[c], points[p], obs_xy[n], loss,
+                d, rig, cam, work, proj, res, jx, jc,
             ):  # fmt: skip
                 continue
             n_rows, dn, rn = as_tuples(jx, d, res)
@@ -143,10 +157,9 @@ def accumulate(
                 at = -1 if slot < 0 else _find(blocks, b0, b1, slot)
                 if at >= 0:
                     _couple_unit(w[at], weight, tn, vn)
-            slot = camera_slot[c]
-            if slot >= 0:
+            if slot_of_camera >= 0:
                 add_inner_sums(s, dn, n_rows, jc, rn, inner_places)
-                at = _find(blocks, b0, b1, num_units + slot)
+                at = _find(blocks, b0, b1, num_units + slot_of_camera)
                 if at >= 0:
                     _couple_camera(w[at], n_rows, jc)
         for i in range(3):
@@ -165,7 +178,7 @@ def accumulate(
         )  # fmt: skip
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _damp(v: Any, damping: float) -> None:
     """Add damping diag V to V."""
     v[0] += damping * v[0]
@@ -173,7 +186,7 @@ def _damp(v: Any, damping: float) -> None:
     v[5] += damping * v[5]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _add_point(v: Any, e: Any, block: Any, gradient: Any) -> None:
     """Add an observation to its point's V and e."""
     v00, v01, v02, v11, v12, v22 = block
@@ -189,7 +202,7 @@ def _add_point(v: Any, e: Any, block: Any, gradient: Any) -> None:
     e[2] += e2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _couple_unit(w: Any, weight: float, t: Any, v: Any) -> None:
     """Add weight [V [d]x, -V] of an observation to w (3, at least 6)."""
     v00, v01, v02, v11, v12, v22 = v
@@ -214,7 +227,7 @@ def _couple_unit(w: Any, weight: float, t: Any, v: Any) -> None:
     w[2, 5] -= weight * v22
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _couple_camera(w: Any, n_rows: Any, jc: Any) -> None:
     """Add N' J of an observation, J its derivatives in the camera, to w (3, camera's unknowns)."""
     (a0, a1, a2), (c0, c1, c2) = n_rows
@@ -225,7 +238,7 @@ def _couple_camera(w: Any, n_rows: Any, jc: Any) -> None:
         w[2, i] += x0 * a2 + x1 * c2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _subtract_gradient(
     w: Any, inv: Any, e: Any, blocks: Any, b0: int, b1: int, num_units: int, dof: int, g: Any
 ) -> None:
@@ -239,7 +252,7 @@ def _subtract_gradient(
             g[o + a] -= w[i, 0, a] * x0 + w[i, 1, a] * x1 + w[i, 2, a] * x2
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def _subtract_products(
     w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int,
     inner_places: Any, places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,

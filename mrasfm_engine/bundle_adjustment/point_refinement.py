@@ -22,16 +22,17 @@ from mrasfm_engine.bundle_adjustment.kernels import (
     Views,
     camera_point,
     linearise,
+    workspace,
 )
 from mrasfm_engine.bundle_adjustment.point_elimination import invert3
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 
 CONVERGED = 3e-3  # change of cost an observation, below which the derivatives have led a point far enough
 WORTH = 3e-2  # gain an observation, after which a point is still far enough from its minimum for one more step
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def _point_cost(
     views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, scale2: float, x: Any,
     d: Any, rig: Any, cam: Any, work: Any, proj: Any,
@@ -55,7 +56,7 @@ def _point_cost(
     return result + math.log(product)
 
 
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted()
 def _point_system(
     views: Views, bands: Bands | None, observed: Observed, begin: int, end: int, loss: Loss,
     x: Any, d: Any, rig: Any, cam: Any, work: Any, proj: Any, res: Any, jx: Any, jc: Any, v: Any, e: Any,
@@ -67,8 +68,9 @@ def _point_system(
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]
         if not linearise(
-            views.unit_r[u], views.unit_t[u], bands, band, np.bool_(False), c, views.cam_r[c], views.cam_t[c],
-            views.kind[c], views.params[c], x, observed.xy[n], loss, d, rig, cam, work, proj, res, jx, jc,
+            views.unit_r[u], views.unit_t[u], bands, band, np.bool_(False), c, np.bool_(False), views.cam_r[c],
+            views.cam_t[c], views.kind[c], views.params[c], x, observed.xy[n], loss,
+            d, rig, cam, work, proj, res, jx, jc,
         ):  # fmt: skip
             continue
         a0, a1, a2 = jx[0, 0], jx[0, 1], jx[0, 2]
@@ -84,7 +86,7 @@ def _point_system(
         e[2] += a2 * res[0] + c2 * res[1]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def refine_points(
     views: Views, bands: Bands | None, points: Any, observed: Observed, loss: Loss,
     before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
@@ -95,9 +97,19 @@ def refine_points(
     `before` goes back there if that is better. A point whose cost has hardly changed needs no more; every other makes a
     step of its own, if it is for the better, and up to `steps` as long as these gain.
     """
-    d, rig, cam, work, proj, res = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8), np.empty(2)
-    jx, jc, v, e, inv = np.empty((2, 3)), np.empty((2, 7)), np.empty(6), np.empty(3), np.empty(6)
-    x, trial = np.empty(3), np.empty(3)
+    _refine_points(
+        views, bands, points, observed, loss, before, costs_before, steps, lo, hi, costs,
+        workspace(7), np.empty(6), np.empty(3), np.empty(6), np.empty(3), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _refine_points(
+    views: Views, bands: Bands | None, points: Any, observed: Observed, loss: Loss,
+    before: Any, costs_before: Any, steps: int, lo: int, hi: int, costs: Any,
+    memory: Any, v: Any, e: Any, inv: Any, x: Any, trial: Any,
+) -> None:  # fmt: skip
+    d, rig, cam, work, proj, res, jx, jc = memory
     scale2 = loss.scale2 * loss.sigma * loss.sigma
     for p in range(lo, hi):
         begin, end = observed.first[p], observed.first[p + 1]
@@ -146,12 +158,22 @@ def refine_points(
             points[p, i] = x[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def point_costs(
     views: Views, bands: Bands | None, points: Any, observed: Observed, scale2: float, lo: int, hi: int, costs: Any
 ) -> None:
     """Compute the cost of points lo..hi: sums of log(1 + r^2 / scale^2) over their observations."""
-    d, rig, cam, work, proj = np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
+    _point_costs(
+        views, bands, points, observed, scale2, lo, hi, costs,
+        np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8),
+    )  # fmt: skip
+
+
+@uncounted()
+def _point_costs(
+    views: Views, bands: Bands | None, points: Any, observed: Observed, scale2: float, lo: int, hi: int, costs: Any,
+    d: Any, rig: Any, cam: Any, work: Any, proj: Any,
+) -> None:  # fmt: skip
     for p in range(lo, hi):
         costs[p] = _point_cost(
             views, bands, observed, observed.first[p], observed.first[p + 1], scale2, points[p],

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera
 
@@ -131,7 +131,7 @@ def largest_angle_rad(params: Floats) -> float:
     return math.acos(float(params[LIMIT]))
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
     """Distorted (a', b') of (a, b) into out[0:2] and d(a', b')/d(a, b), row by row, into out[2:6]; of no fisheye."""
     out[0], out[1], out[2], out[3], out[4], out[5] = a, b, 1.0, 0.0, 0.0, 1.0
@@ -155,7 +155,7 @@ def distort(kind: int, k: Any, a: float, b: float, out: Any) -> None:
         out[5] = radial + b * b * slope + 2.0 * p2 * a + 6.0 * p1 * b
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def inverse_depth(kind: int, k: Any, z: float, d2: float) -> float:
     """Factor from x and y to (a, b) of a point at a squared distance d2; of no fisheye."""
     if kind == 4:
@@ -163,7 +163,7 @@ def inverse_depth(kind: int, k: Any, z: float, d2: float) -> float:
     return 1.0 / z
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any) -> bool:
     """Pixel of a point in camera axes into out[0:2] and d(pixel)/d(x, y, z), row by row, into out[2:8].
 
@@ -222,10 +222,14 @@ def project(kind: int, k: Any, x: float, y: float, z: float, work: Any, out: Any
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _largest_angle(kind: int, k: Any, widest: float) -> float:
     """Largest angle from the axis, up to the widest, within which pixels move outwards with it in all directions."""
-    work, out = np.empty(6), np.empty(8)
+    return _outwards_to(kind, k, widest, np.empty(6), np.empty(8))  # type: ignore[no-any-return]
+
+
+@uncounted()
+def _outwards_to(kind: int, k: Any, widest: float, work: Any, out: Any) -> float:
     for i in range(1, ANGLES + 1):
         theta = widest * i / ANGLES
         z, r = math.cos(theta), math.sin(theta)
@@ -246,9 +250,13 @@ def _largest_angle(kind: int, k: Any, widest: float) -> float:
     return widest
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def _project_points(kind: int, k: Any, points: Any, pixels: Any) -> None:
-    work, out = np.empty(6), np.empty(8)
+    _project_each(kind, k, points, np.empty(6), np.empty(8), pixels)
+
+
+@uncounted()
+def _project_each(kind: int, k: Any, points: Any, work: Any, out: Any, pixels: Any) -> None:
     for i in range(len(points)):
         if project(kind, k, points[i, 0], points[i, 1], points[i, 2], work, out):
             pixels[i, 0], pixels[i, 1] = out[0], out[1]
@@ -256,11 +264,15 @@ def _project_points(kind: int, k: Any, points: Any, pixels: Any) -> None:
             pixels[i, 0] = pixels[i, 1] = np.nan
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _unproject_pixels(kind: int, k: Any, pixels: Any, rays: Any) -> None:
+    _unproject_each(kind, k, pixels, np.empty(6), np.empty(8), rays)
+
+
+@uncounted()
+def _unproject_each(kind: int, k: Any, pixels: Any, work: Any, out: Any, rays: Any) -> None:
     """Newton's steps along the direction of the pixel from the axis, between bounds, and then, where lenses are not
     centred, in both coordinates."""
-    work, out = np.empty(6), np.empty(8)
     widest = math.acos(k[8])
     for i in range(len(pixels)):
         u, v = (pixels[i, 0] - k[2]) / k[0], (pixels[i, 1] - k[3]) / k[1]

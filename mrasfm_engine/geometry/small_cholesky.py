@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import uncounted
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def factorise(a: Any, unknowns: int, factor: Any) -> bool:
     """Cholesky factor of an information matrix; False where it is not positive."""
     for i in range(unknowns):
@@ -25,7 +25,7 @@ def factorise(a: Any, unknowns: int, factor: Any) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def solve(factor: Any, b: Any, unknowns: int, out: Any) -> None:
     """Solve with the factor of `factorise`."""
     for i in range(unknowns):
@@ -40,7 +40,7 @@ def solve(factor: Any, b: Any, unknowns: int, out: Any) -> None:
         out[i] = s / factor[i, i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def log_determinant(factor: Any, unknowns: int) -> float:
     """Logarithm of the determinant of what was factorised."""
     result = 0.0

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Floats, Ints
 
 MAX_HYPOTHESES = 24  # pairs of rays tried a track
@@ -51,6 +51,7 @@ class Work(NamedTuple):
     projected: Floats
     h: Floats
     g: Floats
+    hypothesis: Floats
 
 
 @njit(cache=True)
@@ -61,15 +62,11 @@ def _room_for_rays() -> TrackRays:
 
 @njit(cache=True)
 def _room_for_work() -> Work:
-    return Work(np.empty(3), np.empty(6), np.empty(8), np.empty(6), np.empty(3))
+    return Work(np.empty(3), np.empty(6), np.empty(8), np.empty(6), np.empty(3), np.empty(3))
 
 
-# Taking an array out of a tuple counts a reference to it, which costs as much as the arithmetic of one observation:
-# kernels take tuples apart once, and pass arrays to what they call for every observation.
-
-
-@njit(cache=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, distorted: Any, projected: Any) -> Any:
+@uncounted()
+def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, distorted: Any, projected: Any) -> float:
     """Squared reprojection error of x under cam_from_world (r, t); huge where it is not seen."""
     for i in range(3):
         cam[i] = r[i, 0] * x[0] + r[i, 1] * x[1] + r[i, 2] * x[2] + t[i]
@@ -77,10 +74,10 @@ def _error2(r: Any, t: Any, kind: int, params: Any, x: Any, xy: Any, cam: Any, d
         return NOT_SEEN_PX2
     if not project(kind, params, cam[0], cam[1], cam[2], distorted, projected):
         return NOT_SEEN_PX2
-    return (projected[0] - xy[0]) ** 2 + (projected[1] - xy[1]) ** 2
+    return float((projected[0] - xy[0]) ** 2 + (projected[1] - xy[1]) ** 2)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _ray_in_world(r: Any, t: Any, ray: Any, origin: Any, direction: Any) -> None:
     """Write a ray of a camera into the world's axes: its origin and its direction."""
     for i in range(3):
@@ -88,13 +85,14 @@ def _ray_in_world(r: Any, t: Any, ray: Any, origin: Any, direction: Any) -> None
         direction[i] = r[0, i] * ray[0] + r[1, i] * ray[1] + r[2, i] * ray[2]
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
-def _cosine(direction: Any, i: int, j: int) -> Any:
+@uncounted(forceinline=True)
+def _cosine(direction: Any, i: int, j: int) -> float:
     """Cosine of the angle between two rays of a track."""
-    return direction[i, 0] * direction[j, 0] + direction[i, 1] * direction[j, 1] + direction[i, 2] * direction[j, 2]
+    c = direction[i, 0] * direction[j, 0] + direction[i, 1] * direction[j, 1] + direction[i, 2] * direction[j, 2]
+    return float(c)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _meet(origin: Any, direction: Any, i: int, j: int, c: float, x: Any) -> bool:
     """Write the point midway between two rays, the cosine of whose angle is c, into x; False where it is behind."""
     w0, w1, w2 = origin[j, 0] - origin[i, 0], origin[j, 1] - origin[i, 1], origin[j, 2] - origin[i, 2]
@@ -111,15 +109,15 @@ def _meet(origin: Any, direction: Any, i: int, j: int, c: float, x: Any) -> bool
     return True
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _best_hypothesis(
     posed: PosedKeypoints, track_rays: TrackRays, count: int, max_error2: float, cos_limit: float, best: Any, work: Work
 ) -> bool:
     """Write the point of two rays on which most observations agree into `best`; False where no two rays give one."""
     band, camera, xy, _, r, t, kind, params = posed
     keypoint, _, origin, direction = track_rays
-    cam, distorted, projected, _, _ = work
-    x, best_score = np.empty(3), 0.0
+    cam, distorted, projected, _, _, x = work
+    best_score = 0.0
     total = count * (count - 1) // 2
     stride = max(1, total // MAX_HYPOTHESES)
     if stride > 1 and stride % 2 == 0:
@@ -142,18 +140,19 @@ def _best_hypothesis(
                     score += max_error2 - e2
             if score > best_score:
                 best_score = score
-                best[:] = x
+                for q in range(3):
+                    best[q] = x[q]
     return best_score > 0.0
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _mark_inliers(
     posed: PosedKeypoints, track_rays: TrackRays, count: int, max_error2: float, x: Any, work: Work
 ) -> int:
     """Say which observations agree with x, and how many do."""
     band, camera, xy, _, r, t, kind, params = posed
     keypoint, is_inlier, _, _ = track_rays
-    cam, distorted, projected, _, _ = work
+    cam, distorted, projected, _, _, _ = work
     inliers = 0
     for m in range(count):
         k = keypoint[m]
@@ -164,12 +163,12 @@ def _mark_inliers(
     return inliers
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _refine(posed: PosedKeypoints, track_rays: TrackRays, count: int, scale2: float, x: Any, work: Work) -> None:
     """Move x by Gauss-Newton steps with Cauchy weights over the inliers."""
     band, camera, xy, _, rotation, t, kind, params = posed
     keypoint, is_inlier, _, _ = track_rays
-    cam, distorted, proj, h, g = work
+    cam, distorted, proj, h, g, _ = work
     for _ in range(STEPS):
         h[:] = 0.0
         g[:] = 0.0
@@ -209,7 +208,7 @@ def _refine(posed: PosedKeypoints, track_rays: TrackRays, count: int, scale2: fl
         x[2] -= d2
 
 
-@njit(cache=True, forceinline=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@uncounted(forceinline=True)
 def _is_wide(is_inlier: Any, direction: Any, count: int, cos_limit: float) -> bool:
     """Return whether the rays of two inliers are at least as far apart as the limit's angle."""
     for i in range(count):
@@ -220,16 +219,25 @@ def _is_wide(is_inlier: Any, direction: Any, count: int, cos_limit: float) -> bo
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def triangulate_tracks(
     which: Any, first: Any, track_keypoints: Any, posed: PosedKeypoints, usable: Any, max_error2: float,
     cos_limit: float, points: Any, triangulated: Any, is_inlier: Any,
 ) -> None:  # fmt: skip
     """Triangulate the tracks `which`; see `Triangulator.triangulate` for what is written."""
-    track_rays, work = _room_for_rays(), _room_for_work()
+    _triangulate_tracks(
+        which, first, track_keypoints, posed, usable, max_error2, cos_limit, points, triangulated, is_inlier,
+        _room_for_rays(), _room_for_work(), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _triangulate_tracks(
+    which: Any, first: Any, track_keypoints: Any, posed: PosedKeypoints, usable: Any, max_error2: float,
+    cos_limit: float, points: Any, triangulated: Any, is_inlier: Any, track_rays: TrackRays, work: Work, x: Any,
+) -> None:  # fmt: skip
     band, _, _, rays, r, t, _, _ = posed
     keypoint, use, origin, direction = track_rays
-    x = np.empty(3)
     for n in range(len(which)):
         track = which[n]
         triangulated[track] = False
@@ -258,24 +266,38 @@ def triangulate_tracks(
                 is_inlier[keypoint[m]] = True
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def reprojection_errors2(rows: Any, point: Any, posed: PosedKeypoints, points: Any, out: Any) -> None:
     """Write squared reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) into `out`."""
+    _reprojection_errors2(rows, point, posed, points, out, np.empty(3), np.empty(6), np.empty(8))
+
+
+@uncounted()
+def _reprojection_errors2(
+    rows: Any, point: Any, posed: PosedKeypoints, points: Any, out: Any, cam: Any, distorted: Any, projected: Any
+) -> None:
     band, camera, xy, _, r, t, kind, params = posed
-    cam, distorted, projected, _, _ = _room_for_work()
     for n in range(len(rows)):
         k = rows[n]
         b, of = band[k], camera[k]
         out[n] = _error2(r[b], t[b], kind[of], params[of], points[point[n]], xy[k], cam, distorted, projected)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def tracks_with_angle(
     which: Any, first: Any, track_keypoints: Any, posed: PosedKeypoints, is_inlier: Any, cos_limit: float, out: Any
 ) -> None:
     """Write into `out` (n,) whether two inliers of a track are seen under at least the limit's angle."""
+    _tracks_with_angle(which, first, track_keypoints, posed, is_inlier, cos_limit, out, _room_for_rays())
+
+
+@uncounted()
+def _tracks_with_angle(
+    which: Any, first: Any, track_keypoints: Any, posed: PosedKeypoints, is_inlier: Any, cos_limit: float, out: Any,
+    track_rays: TrackRays,
+) -> None:  # fmt: skip
     band, _, _, rays, r, t, _, _ = posed
-    _, use, origin, direction = _room_for_rays()
+    _, use, origin, direction = track_rays
     use[:] = True
     for n in range(len(which)):
         count: Any = np.int64(0)

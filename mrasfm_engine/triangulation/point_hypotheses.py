@@ -15,7 +15,7 @@ import numpy as np
 
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.geometry.small_cholesky import factorise, solve
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Floats, Ints
 
 STANDS, MOVES = 3, 5  # number of unknowns
@@ -75,7 +75,7 @@ def new_scratch() -> Scratch:
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def _linearise(count: int, unknowns: int, p: Any, sight: Any, views: Any, loss: float, scratch: Any) -> float:
     """Cost of the observations at p; information and gradient, without priors, into scratch."""
     a, b, jacobian, work, out = (
@@ -131,7 +131,7 @@ def _linearise(count: int, unknowns: int, p: Any, sight: Any, views: Any, loss: 
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views: Any, scratch: Any) -> float:
     """Cost of the observations of a point that stands at x, y, z from the reference camera."""
     r, offset, out, total = views.rotation, sight.offset_m, scratch.projected, 0.0
@@ -150,11 +150,11 @@ def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def fit(
     count: int, unknowns: int, is_near: bool, p: Any, mean: Any, weight: Any, least: float, most: float, sight: Any,
     views: Any, scratch: Any,
-) -> Any:  # fmt: skip
+) -> tuple[float, float, bool]:  # fmt: skip
     """Fit p to observations and priors (means and weights by unknown, from the third on), `rho` within its bounds.
 
     Returns the cost with priors, that without, and whether the information at p is positive: its factor is in scratch.
@@ -165,7 +165,8 @@ def fit(
     )  # fmt: skip
     p[2] = min(max(p[2], least), most)
     lowest, lowest_data = np.inf, np.inf
-    best[:] = p
+    for i in range(len(p)):
+        best[i] = p[i]
     for iteration in range(0 if is_near else -ROUGH_ITERATIONS, ITERATIONS + 1):
         data = _linearise(count, unknowns, p, sight, views, LOSS_SIGMAS * 4.0 ** max(-iteration, 0), scratch)
         total = data

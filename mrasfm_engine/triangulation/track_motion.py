@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mrasfm_engine.geometry.small_cholesky import log_determinant, solve
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.triangulation.point_hypotheses import (
     MOVES,
@@ -125,7 +125,7 @@ def weigh_tracks(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
     """Distance along a ray from c at which it is below the ground; infinite where it never is for certain."""
     s, k, last = FIRST_STEP_M, station, len(path.ground_m) - 1
@@ -147,8 +147,8 @@ def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
     return np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
+@uncounted()
+def _begin_of_window(members: Any, band: Any, views: Any) -> tuple[float, int]:
     """Begin of the time in which most of a track's observations are, and about how many these are.
 
     Keypoints are in the order of their units, so that one pass is enough. Cameras of one unit may be in any order, so
@@ -171,8 +171,10 @@ def _begin_of_window(members: Any, band: Any, views: Any) -> Any:
     return begin_s, most
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _look(members: Any, band: Any, camera: Any, xy: Any, rays: Any, views: Any, path: Any, sight: Any, c: Any) -> Any:
+@uncounted()
+def _look(
+    members: Any, band: Any, camera: Any, xy: Any, rays: Any, views: Any, path: Any, sight: Any, c: Any
+) -> tuple[int, int]:
     """Take a track's observations into `sight` and the reference camera's centre into c; how many, and the reference's
     place among them."""
     begin_s, about = _begin_of_window(members, band, views)
@@ -222,19 +224,20 @@ def _look(members: Any, band: Any, camera: Any, xy: Any, rays: Any, views: Any, 
         e[0, j] = ((1.0 if j == axis else 0.0) - d[axis] * d[j]) / norm
     _cross(d, e[0], e[1])
     station = path.station[sight.band[ref]]
-    sight.axes[0, :] = path.forward[station]
+    for j in range(3):
+        sight.axes[0, j] = path.forward[station, j]
     _cross(path.up[station], path.forward[station], sight.axes[1])
     return n, ref
 
 
-@njit(cache=True, nogil=True)
+@uncounted()
 def _cross(a: Any, b: Any, out: Any) -> None:
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def _velocity_covariance(factor: Any, p: Any, gradient: Any, column: Any, out: Any) -> None:
     """Covariance xx, xy, yy of the velocity nu / rho at p, that of rho included."""
     rho = p[2]
@@ -250,7 +253,7 @@ def _velocity_covariance(factor: Any, p: Any, gradient: Any, column: Any, out: A
             out[2] = across
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _weigh(
     which: Any, first: Any, members: Any, band: Any, camera: Any, xy: Any, rays: Any, points: Any, triangulated: Any,
     views: Any, path: Any, only_unsure: bool, evidence: Any, prior: Any, velocity: Any, covariance: Any, distance: Any,
@@ -262,8 +265,20 @@ def _weigh(
         np.empty((most_seen, 2)), np.empty((most_seen, 3)), np.empty(most_seen), np.empty(3), np.empty((2, 3)),
         np.empty((2, 3)),
     )  # fmt: skip
-    scratch = new_scratch()
-    p, start, mean, weight, c = np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5), np.empty(3)
+    _weigh_each(
+        which, first, members, band, camera, xy, rays, points, triangulated, views, path, only_unsure, evidence, prior,
+        velocity, covariance, distance, misfit, observations, reference,
+        sight, new_scratch(), np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _weigh_each(
+    which: Any, first: Any, members: Any, band: Any, camera: Any, xy: Any, rays: Any, points: Any, triangulated: Any,
+    views: Any, path: Any, only_unsure: bool, evidence: Any, prior: Any, velocity: Any, covariance: Any, distance: Any,
+    misfit: Any, observations: Any, reference: Any,
+    sight: Any, scratch: Any, p: Any, start: Any, mean: Any, weight: Any, c: Any,
+) -> None:  # fmt: skip
     nearest = 1.0 / NEAREST_M
     for t in which:
         evidence[t], reference[t] = np.nan, -1
@@ -312,13 +327,13 @@ def _weigh(
         mean[2], weight[2] = expected, 1.0 / (BODY_SHARE * expected) ** 2
         weight[3] = weight[4] = 1.0 / (expected * SPEED_M_S) ** 2
         log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])
-        start[:] = p
+        for i in range(len(p)):
+            start[i] = p[i]
         moves = np.inf
         for from_standing in (False, True):
-            if from_standing:
-                p[:] = start
-            else:
-                p[:] = 0.0
+            for i in range(len(p)):
+                p[i] = start[i] if from_standing else 0.0
+            if not from_standing:
                 p[2] = expected
             total, _, is_sound = fit(
                 n, MOVES, from_standing, p, mean, weight, lowest, nearest, sight, views, scratch

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import gc
+import importlib
 import os
+import pkgutil
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numba.core.errors import NumbaError
+from numba.core.registry import CPUDispatcher
 
+import mrasfm_engine
 from mrasfm_engine import jit
 from mrasfm_engine.bundle_adjustment import kernels, point_refinement
 from mrasfm_engine.matching import sampson
@@ -103,3 +110,42 @@ def test_a_kernel_is_renewed_with_what_it_calls_and_its_constants(tmp_path: Path
     assert run(3, 5, pair=renamed, inner=inner) == [35, 0], "what is kept names a tuple that is not there any more"
     assert run(3, 5, pair=renamed, inner=inner) == [35, 1]
     assert any((tmp_path / "kept" if given_folder else package).rglob("*.nbi"))
+
+
+def test_what_counts_no_references_returns_none() -> None:
+    """An array that such a function returned would be freed while it is in use."""
+    numbers = {"None", "bool", "int", "float", "tuple", "..."}
+    found = 0
+    for module in pkgutil.walk_packages(mrasfm_engine.__path__, "mrasfm_engine."):
+        for value in vars(importlib.import_module(module.name)).values():
+            if isinstance(value, CPUDispatcher) and value.targetoptions.get("_nrt") is False:
+                words = value.py_func.__annotations__["return"].replace("[", " ").replace("]", " ").replace(",", " ")
+                assert set(words.split()) <= numbers, f"{value.py_func.__qualname__} returns {words}"
+                for compiled in value.overloads.values():
+                    assert "array" not in str(compiled.signature.return_type), value.py_func.__qualname__
+                found += 1
+    assert found > 40
+
+
+def test_what_counts_no_references_leaves_those_of_its_arguments() -> None:
+    @jit.uncounted()
+    def total(rows: np.ndarray, which: int) -> float:
+        row, result = rows[which], 0.0
+        for i in range(len(row)):
+            result += row[i]
+        return result
+
+    rows = np.arange(12.0).reshape(3, 4)
+    before = sys.getrefcount(rows)
+    assert [total(rows, i) for i in range(3)] == [6.0, 22.0, 38.0]
+    gc.collect()
+    assert sys.getrefcount(rows) == before
+
+
+def test_what_counts_no_references_cannot_make_an_array() -> None:
+    @jit.uncounted()
+    def made(count: int) -> float:
+        return float(np.zeros(count)[0])
+
+    with pytest.raises(NumbaError, match=r"empty|NRT"):
+        made(3)
