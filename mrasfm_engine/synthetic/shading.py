@@ -10,19 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 
 MAX_TAPS = 4
 
 _SKY = 10
 _DONE = -2
 
-# Depth of the sky; fast arithmetic must not meet infinities.
+# Depth of the sky.
 _SKY_DEPTH = 1e9
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
-def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
+@uncounted(forceinline=True)
+def _bilinear(
+    t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any
+) -> tuple[float, float, float]:
     """Red, green and blue (0..255) of a texture's level at texture coordinates, which repeat with period 1."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
     x, y = u * w - 0.5, v * h - 0.5
@@ -40,8 +42,8 @@ def _bilinear(t: int, level: int, u: float, v: float, texels: Any, offset: Any, 
     return red, green, blue
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
-def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> Any:
+@uncounted(forceinline=True)
+def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: Any, log2_w: Any, log2_h: Any) -> float:
     """The first channel of `_bilinear`."""
     w, h = max(1, 1 << log2_w[t] >> level), max(1, 1 << log2_h[t] >> level)
     x, y = u * w - 0.5, v * h - 0.5
@@ -52,11 +54,13 @@ def _bilinear_grey(t: int, level: int, u: float, v: float, texels: Any, offset: 
     base = offset[t, level]
     upper = (1 - ax) * (texels[base + r0 * w + c0] & 255) + ax * (texels[base + r0 * w + c1] & 255)
     lower = (1 - ax) * (texels[base + r1 * w + c0] & 255) + ax * (texels[base + r1 * w + c1] & 255)
-    return (1 - ay) * upper + ay * lower
+    return float((1 - ay) * upper + ay * lower)
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
-def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any) -> Any:
+@uncounted(forceinline=True)
+def _footprint(
+    t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, log2_h: Any, levels: Any
+) -> tuple[int, float, float, int, float]:
     """Number of taps, the edge along which they lie, the mip level and the share of the next coarser one.
 
     The footprint has the edges (ux, vx) and (uy, vy) in texture coordinates.
@@ -78,7 +82,7 @@ def _footprint(t: int, ux: float, vx: float, uy: float, vy: float, log2_w: Any, 
     return taps, du, dv, level, fraction
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
+@uncounted(forceinline=True)
 def _filtered(
     t: int,
     u: float,
@@ -92,7 +96,7 @@ def _filtered(
     log2_w: Any,
     log2_h: Any,
     levels: Any,
-) -> Any:
+) -> tuple[float, float, float]:
     """The texture's mean colour over a pixel, by trilinear taps."""
     taps, du, dv, level, fraction = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
     red, green, blue = 0.0, 0.0, 0.0
@@ -106,7 +110,7 @@ def _filtered(
     return red / taps, green / taps, blue / taps
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
+@uncounted(forceinline=True)
 def _filtered_grey(
     t: int,
     u: float,
@@ -120,7 +124,7 @@ def _filtered_grey(
     log2_w: Any,
     log2_h: Any,
     levels: Any,
-) -> Any:
+) -> float:
     """The first channel of `_filtered`."""
     taps, du, dv, level, fraction = _footprint(t, ux, vx, uy, vy, log2_w, log2_h, levels)
     total = 0.0
@@ -131,10 +135,10 @@ def _filtered_grey(
             coarse = _bilinear_grey(t, level + 1, u + f * du, v + f * dv, texels, offset, log2_w, log2_h)
             value += fraction * (coarse - value)
         total += value
-    return total / taps
+    return float(total / taps)
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
+@uncounted(forceinline=True)
 def _sun_reaches(
     x: float,
     y: float,
@@ -145,7 +149,7 @@ def _sun_reaches(
     shadow_frame: Any,
     boxes: Any,
     casters: int,
-) -> Any:
+) -> float:
     """Share of the sun that a world point sees: 0 in full shadow, 1 in none.
 
     `shadow_frame` is the map's x0, y0 and cell size in the sun's frame. The first `casters` rows of `boxes` (k, 8)
@@ -198,7 +202,7 @@ def _sun_reaches(
     return lit
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
+@uncounted(forceinline=True)
 def _sky(
     x: float,
     y: float,
@@ -209,7 +213,7 @@ def _sky(
     offset: Any,
     log2_w: Any,
     log2_h: Any,
-) -> Any:
+) -> tuple[float, float, float]:
     """Colour of the sky along the ray (x, y, 1): haze below, blue above, clouds, and a glow around the sun."""
     d0 = world_from_cam[0, 0] * x + world_from_cam[0, 1] * y + world_from_cam[0, 2]
     d1 = world_from_cam[1, 0] * x + world_from_cam[1, 1] * y + world_from_cam[1, 2]
@@ -227,7 +231,7 @@ def _sky(
     return red, green, blue
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=True)
+@uncounted(forceinline=True)
 def _surface(
     i: int,
     x: float,
@@ -255,9 +259,8 @@ def _surface(
     shadow_map: Any,
     shadow_frame: Any,
     boxes: Any,
-) -> Any:
+) -> tuple[float, float, float, float]:
     """Colour and depth of primitive i along the ray (x, y, 1), which changes by (xx, yx) a column, (xy, yy) a row."""
-    # No views of arrays in here: each one would count references, which costs more than the arithmetic.
     a = plane[i, 0, 0] * x + plane[i, 0, 1] * y + plane[i, 0, 2]
     b = plane[i, 1, 0] * x + plane[i, 1, 1] * y + plane[i, 1, 2]
     z = 1.0 / max(plane[i, 2, 0] * x + plane[i, 2, 1] * y + plane[i, 2, 2], 1e-5)
@@ -335,7 +338,7 @@ def _surface(
     return red, green, blue, z
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
+@njit(cache=True, nogil=True)
 def shade(
     index: Any,
     ideal: Any,
@@ -370,8 +373,21 @@ def shade(
     coordinates of pixel centres. `light` (7, 3): direction to the sun, sun, sky light, haze colour, zenith colour,
     (haze distance, shadow strength, cloudiness), sun's glow. A pixel's class and depth are those of most samples.
     """
+    _shade_pixels(
+        index, ideal, plane, world_from_cam, texture, texture_uv, detail, detail_uv, tint, normal, label, is_moving,
+        texels, offset, log2_w, log2_h, levels, light, sun_from_world, shadow_map, shadow_frame, boxes, sky_texture,
+        image, labels, depth, np.zeros(4, np.int64),
+    )  # fmt: skip
+
+
+@uncounted()
+def _shade_pixels(
+    index: Any, ideal: Any, plane: Any, world_from_cam: Any, texture: Any, texture_uv: Any, detail: Any, detail_uv: Any,
+    tint: Any, normal: Any, label: Any, is_moving: Any, texels: Any, offset: Any, log2_w: Any, log2_h: Any, levels: Any,
+    light: Any, sun_from_world: Any, shadow_map: Any, shadow_frame: Any, boxes: Any, sky_texture: int,
+    image: Any, labels: Any, depth: Any, ids: Any,
+) -> None:  # fmt: skip
     height, width = image.shape[0], image.shape[1]
-    ids = np.zeros(4, np.int64)
     for row in range(height):
         for col in range(width):
             x, y = ideal[row, col, 0], ideal[row, col, 1]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
 from mrasfm_engine.visualization.pixel_lattice import (
@@ -189,7 +189,7 @@ def _empty(grid: Grid) -> Mosaic:
     )
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: float) -> int:
     """Layer that a camera's view of this score belongs to, -1 if to none; the best is moved down where it must."""
     if owner[0, row, column] == camera:
@@ -199,7 +199,7 @@ def _layer_for(owner: Any, score: Any, row: int, column: int, camera: int, s: fl
     return 1 if s > score[1, row, column] else -1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
+@njit(cache=True, nogil=True)
 def _paint(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, centre: Any, rig_from_plan: Any, own_car: Any,
     kind: int, params: Any, gain: Any, camera: int, heights: Any, place: Any, bounds: Any,
@@ -208,14 +208,27 @@ def _paint(
     """Colour the cells that the image sees better than what is there; how many."""
     cell, first = place[2], place[3:5]
     x_first, y_first = place[0] + 0.5 * cell, place[1] - 0.5 * cell
-    focal = math.sqrt(params[1, 0] * params[1, 1])
-    work, pixel, cam = np.empty(6), np.empty(8), np.empty(3)
     rows, columns, nodes = place_nodes(
         x_first, y_first, cell, bounds, step, cam_from_plan[1], centre, kind, params[1], heights, first
     )
     given = place_nodes(
         x_first, y_first, cell, bounds, step, cam_from_plan[0], centre, kind, params[0], heights, first
     )[2]
+    return _paint_squares(  # type: ignore[no-any-return]
+        rgb, usable, has_mask, cam_from_plan, centre, rig_from_plan, own_car, kind, params, gain, camera, heights,
+        x_first, y_first, cell, first, rows, columns, nodes, given, owner, score, color,
+        np.empty(6), np.empty(8), np.empty(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _paint_squares(
+    rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, centre: Any, rig_from_plan: Any, own_car: Any,
+    kind: int, params: Any, gain: Any, camera: int, heights: Any, x_first: float, y_first: float, cell: float,
+    first: Any, rows: Any, columns: Any, nodes: Any, given: Any, owner: Any, score: Any, color: Any,
+    work: Any, pixel: Any, cam: Any,
+) -> int:  # fmt: skip
+    focal = math.sqrt(params[1, 0] * params[1, 1])
     painted = 0
     for i, j in np.ndindex(len(rows) - 1, len(columns) - 1):
         square = square_kind(nodes, i, j, rgb.shape[1], rgb.shape[0], focal, centre[2])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.visualization.views import MIN_RESOLUTION_PX, OWN_CAR_LEVEL, VIEW_M, height_at
 
 NODE_CELLS = 8  # of a square's side
@@ -27,7 +27,7 @@ def node_step(cell_m: float) -> int:
     return max(1, min(NODE_CELLS, int(MAX_NODE_M / cell_m + 1e-9)))
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
+@njit(cache=True, nogil=True)
 def place_nodes(
     x_first: float, y_first: float, cell: float, bounds: Any, step: int, cam_from_plan: Any, centre: Any, kind: int,
     params: Any, heights: Any, first: Any,
@@ -48,8 +48,18 @@ def place_nodes(
     rows = _nodes(bounds[0], bounds[1], step)
     columns = _nodes(bounds[2], bounds[3], step)
     nodes = np.empty((len(rows), len(columns), 4))
-    work, pixel = np.empty(6), np.empty(8)
-    m = cam_from_plan
+    _place_each(
+        x_first, y_first, cell, cam_from_plan, centre, kind, params, heights, first, rows, columns,
+        np.empty(6), np.empty(8), nodes,
+    )  # fmt: skip
+    return rows, columns, nodes
+
+
+@uncounted()
+def _place_each(
+    x_first: float, y_first: float, cell: float, m: Any, centre: Any, kind: int, params: Any, heights: Any, first: Any,
+    rows: Any, columns: Any, work: Any, pixel: Any, nodes: Any,
+) -> None:  # fmt: skip
     for i in range(len(rows)):
         y = y_first - rows[i] * cell
         for j in range(len(columns)):
@@ -63,7 +73,6 @@ def place_nodes(
             if project(kind, params, a, b, c, work, pixel):
                 nodes[i, j, 0], nodes[i, j, 1] = pixel[0], pixel[1]
             nodes[i, j, 2], nodes[i, j, 3] = z, math.sqrt(dx * dx + dy * dy + dz * dz)
-    return rows, columns, nodes
 
 
 @njit(cache=True, forceinline=True, error_model="numpy")
@@ -74,7 +83,7 @@ def _nodes(begin: int, end: int, step: int) -> Any:
     return result
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def square_kind(nodes: Any, i: int, j: int, width: int, height: int, focal: float, centre_z: float) -> int:
     """Treatment of a square: see `SKIPPED`."""
     shown, nearest, farthest = 0, 1e300, 0.0
@@ -102,15 +111,17 @@ def square_kind(nodes: Any, i: int, j: int, width: int, height: int, focal: floa
     return LINEAR
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def all_shown(nodes: Any, i: int, j: int) -> bool:
     """Return whether the camera shows all corners of a square."""
     total = nodes[i, j, 0] + nodes[i, j + 1, 0] + nodes[i + 1, j, 0] + nodes[i + 1, j + 1, 0]
     return bool(total == total)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
-def between_nodes(nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int, column: int) -> Any:
+@uncounted(forceinline=True)
+def between_nodes(
+    nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int, column: int
+) -> tuple[float, float, float]:
     """Pixel u, v and height z of a cell, bilinear between the corners of its square."""
     a = (row - rows[i]) / (rows[i + 1] - rows[i])
     b = (column - columns[j]) / (columns[j + 1] - columns[j])
@@ -123,7 +134,7 @@ def between_nodes(nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int,
     )
 
 
-@njit(cache=True, nogil=True)
+@uncounted()
 def meets_car(
     rig_from_plan: Any, own_car: Any, x_first: float, y_first: float, cell: float, rows: Any, columns: Any,
     nodes: Any, i: int, j: int, centre: Any,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 from mrasfm_engine.visualization.pixel_lattice import (
     LINEAR,
@@ -177,23 +177,35 @@ def log_ratios(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float, 
     return found[:count]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "arcp"})
+@njit(cache=True, nogil=True)
 def _add(
     rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
     own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, place: int, cell: float,
     first_row: int, first_column: int, bounds: Any, step: int, count: Any, color: Any, quality: Any, places: Any,
 ) -> int:  # fmt: skip
     """Offer the view to every cell; to how many it is added."""
-    height, width = rgb.shape[0], rgb.shape[1]
-    most, middle = quality.shape[2], hidden.shape[0] // 2
-    focal = math.sqrt(params[0] * params[1])
-    rim = RIM_SHARE * min(width, height)
-    work, pixel = np.empty(6), np.empty(8)
-    seen = np.empty(3, np.uint8)
     x_first, y_first = (first_column + 0.5) * cell, -(first_row + 0.5) * cell
     rows, columns, nodes = place_nodes(
         x_first, y_first, cell, bounds, step, cam_from_plan, centre, kind, params, heights, first
     )
+    return _add_to_squares(  # type: ignore[no-any-return]
+        rgb, usable, has_mask, hidden, cam_from_plan, centre, rig_from_plan, own_car, kind, params, heights, first,
+        gain, place, cell, x_first, y_first, rows, columns, nodes, count, color, quality, places,
+        np.empty(6), np.empty(8), np.empty(3, np.uint8),
+    )  # fmt: skip
+
+
+@uncounted()
+def _add_to_squares(
+    rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
+    own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, place: int, cell: float,
+    x_first: float, y_first: float, rows: Any, columns: Any, nodes: Any, count: Any, color: Any, quality: Any,
+    places: Any, work: Any, pixel: Any, seen: Any,
+) -> int:  # fmt: skip
+    height, width = rgb.shape[0], rgb.shape[1]
+    most, middle = quality.shape[2], hidden.shape[0] // 2
+    focal = math.sqrt(params[0] * params[1])
+    rim = RIM_SHARE * min(width, height)
     added = 0
     for i, j in np.ndindex(len(rows) - 1, len(columns) - 1):
         square = square_kind(nodes, i, j, width, height, focal, centre[2])
@@ -272,8 +284,20 @@ def _ratios(
     first_row: int, first_column: int, bounds: Any, count: Any, color: Any, quality: Any, found: Any,
 ) -> int:  # fmt: skip
     """Compare the view with the best one of every few cells; of how many."""
-    work, pixel = np.empty(6), np.empty(8)
-    seen = np.empty(3, np.uint8)
+    return _compare(  # type: ignore[no-any-return]
+        rgb, usable, has_mask, hidden, cam_from_plan, centre, rig_from_plan, own_car, kind, params, heights, first,
+        gain, cell, first_row, first_column, bounds, count, color, quality, found,
+        np.empty(6), np.empty(8), np.empty(3, np.uint8),
+    )  # fmt: skip
+
+
+@uncounted()
+def _compare(
+    rgb: Any, usable: Any, has_mask: bool, hidden: Any, cam_from_plan: Any, centre: Any, rig_from_plan: Any,
+    own_car: Any, kind: int, params: Any, heights: Any, first: Any, gain: Any, cell: float,
+    first_row: int, first_column: int, bounds: Any, count: Any, color: Any, quality: Any, found: Any,
+    work: Any, pixel: Any, seen: Any,
+) -> int:  # fmt: skip
     filled, middle = 0, hidden.shape[0] // 2
     for row in range(bounds[0] + (-(first_row + bounds[0])) % COMPARED_CELLS, bounds[1], COMPARED_CELLS):
         y = -(first_row + row + 0.5) * cell

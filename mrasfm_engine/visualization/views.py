@@ -16,7 +16,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project, unproject_pixels
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import uncounted
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import HEIGHT_STEP_M, GroundTiles
@@ -155,7 +155,7 @@ def _footprint(view: View, lowest_m: float) -> tuple[Floats, Floats] | None:
     return at.min(0) - FOOTPRINT_MARGIN_M, at.max(0) + FOOTPRINT_MARGIN_M
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def height_at(heights: Any, right_m: float, up_m: float) -> float:
     """Bilinear between the corners of the height grid."""
     a, b = up_m / HEIGHT_STEP_M, right_m / HEIGHT_STEP_M
@@ -166,7 +166,7 @@ def height_at(heights: Any, right_m: float, up_m: float) -> float:
     return float(here * (1 - a) + next_up * a)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -> bool:
     """Return whether a place of the plan frame lies in a rectangle (2, 2) of the rig's x and y, lowest first."""
     for i in range(2):
@@ -176,7 +176,7 @@ def inside_car(rig_from_plan: Any, own_car: Any, x: float, y: float, z: float) -
     return True
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def find_pixel(
     rgb: Any, usable: Any, has_mask: bool, cam_from_plan: Any, rig_from_plan: Any, own_car: Any, kind: int,
     params: Any, x: float, y: float, z: float, dx: float, dy: float, above: float, work: Any,
@@ -194,7 +194,7 @@ def find_pixel(
     return not hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above)
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def shows(rgb: Any, usable: Any, has_mask: bool, u: float, v: float) -> bool:
     """Return whether a pixel is in the image, and usable."""
     if not (0.0 <= u < rgb.shape[1] and 0.0 <= v < rgb.shape[0]):
@@ -202,7 +202,7 @@ def shows(rgb: Any, usable: Any, has_mask: bool, u: float, v: float) -> bool:
     return bool(not has_mask or usable[int(v), int(u)])
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def hidden_by_car(
     rig_from_plan: Any, own_car: Any, x: float, y: float, z: float, dx: float, dy: float, above: float
 ) -> bool:
@@ -214,7 +214,7 @@ def hidden_by_car(
     )
 
 
-@njit(cache=True, forceinline=True, error_model="numpy")
+@uncounted(forceinline=True)
 def sample(rgb: Any, u: float, v: float, gain: Any, out: Any) -> None:
     """Bilinear colour at a pixel position whose top left pixel has its centre at (0.5, 0.5)."""
     height, width = rgb.shape[0], rgb.shape[1]
