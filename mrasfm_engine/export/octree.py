@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Ints, Ints32
 
 GRID_BITS = 7
@@ -65,8 +65,8 @@ def _sorted_into_nodes(steps: Any, order: Any, seen: Any, side: int, depth: int,
     return nodes[:known]
 
 
-@njit(cache=True, nogil=True)
-def _keep_first_of_cells(steps: Any, order: Any, seen: Any, side: int, node: Any, rest: Any, octant: Any) -> Any:
+@uncounted()
+def _keep_first_of_cells(steps: Any, order: Any, seen: Any, side: int, node: Any, rest: Any, octant: Any) -> int:
     """Move the first point of each grid cell to the front of `order`, the others and their octants to `rest`.
 
     `seen` (GRID^3,) is false everywhere, before and after; the number of points in front is returned.
@@ -89,8 +89,8 @@ def _keep_first_of_cells(steps: Any, order: Any, seen: Any, side: int, node: Any
     return kept
 
 
-@njit(cache=True, nogil=True)
-def _cell(point: Any, side: int, node: Any) -> Any:
+@uncounted(forceinline=True)
+def _cell(point: Any, side: int, node: Any) -> tuple[int, int, int]:
     """The grid cell of a node that a point is in; what is at the very end of the cube is in the last one."""
     bits = node[0] + GRID_BITS
     last = (1 << bits) - 1

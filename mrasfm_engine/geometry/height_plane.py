@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Floats, Ints
 
 HYPOTHESES = 96  # planes through three points
@@ -107,7 +107,7 @@ def refit_height_planes(
     return result, support, count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def _refit(
     planes: Any, first: Any, xy: Any, height: Any, sigma: Any, weight: Any, slopes: Any, sigma_slope: float,
     support: Any, count: Any,
@@ -188,7 +188,7 @@ def _best(
     return found
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def _optimise(x: Any, xy: Any, height: Any, sigma: Any, weight: Any, expected: Any, sigma_slope: float) -> None:
     """Least squares with Tukey's weights from a hypothesis x (3,), in place, with the prior on the slope."""
     prior = 1.0 / sigma_slope**2

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mrasfm_engine.config import MatchConfig
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -60,8 +60,8 @@ def _fold_lanes(top: Any, second: Any, new_top: Any, new_second: Any) -> None:
         new_top[k] = max(t, u)
 
 
-@njit(cache=True, nogil=True)
-def _two_largest(row: Any, top: Any, second: Any, new_top: Any, new_second: Any) -> Any:
+@uncounted()
+def _two_largest(row: Any, top: Any, second: Any, new_top: Any, new_second: Any) -> tuple[float, float]:
     """The largest value of a row (whole LANES), and the largest of the others; the rest is work space (LANES,)."""
     top[:] = -2.0
     second[:] = -2.0
@@ -74,7 +74,8 @@ def _two_largest(row: Any, top: Any, second: Any, new_top: Any, new_second: Any)
         _fold_lanes(top[:lanes], second[:lanes], new_top[:half], new_second[:half])
         top, new_top, second, new_second = new_top, top, new_second, second
         lanes = half
-    largest, next_largest = np.float32(-2.0), np.float32(-2.0)
+    largest: Any = np.float32(-2.0)
+    next_largest = largest
     for k in range(lanes):
         next_largest = max(next_largest, max(second[k], min(largest, top[k])))
         largest = max(largest, top[k])
@@ -97,11 +98,23 @@ def _take_rows(
     Rows whose best column does not pass the ratio test of distances have none (-1). `missing` (n,) is added to the
     products, (n,) and (m,) are inverse lengths.
     """
-    n, m = products.shape
+    m = products.shape[1]
     row = np.full((m + LANES - 1) // LANES * LANES, np.float32(-2.0))
     top, second = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     new_top, new_second = np.empty(LANES, np.float32), np.empty(LANES, np.float32)
     columns, new_columns = col_top.copy(), np.empty_like(col_top)
+    _take_each(
+        products, missing, factors_a, factors_b, ratio2, col_top, row_top, row_best,
+        row, top, second, new_top, new_second, columns, new_columns,
+    )  # fmt: skip
+
+
+@uncounted()
+def _take_each(
+    products: Any, missing: Any, factors_a: Any, factors_b: Any, ratio2: float, col_top: Any, row_top: Any,
+    row_best: Any, row: Any, top: Any, second: Any, new_top: Any, new_second: Any, columns: Any, new_columns: Any,
+) -> None:  # fmt: skip
+    n, m = products.shape
     for i in range(n):
         _scale(products[i], missing[i], factors_a[i], factors_b, row)
         _larger(columns, row, new_columns)
@@ -114,7 +127,8 @@ def _take_rows(
                 if row[j] == largest:
                     row_top[i], row_best[i] = largest, j
                     break
-    col_top[:] = columns
+    for j in range(m):
+        col_top[j] = columns[j]
 
 
 @njit(cache=True, nogil=True)

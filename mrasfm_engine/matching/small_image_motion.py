@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry.small_cholesky import factorise, solve
 from mrasfm_engine.io.images import read_image_small
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Floats32
 
@@ -87,11 +88,24 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
     height, width = before.shape
     rows, columns = (height - 2) // BLOCK_PX, (width - 2) // BLOCK_PX
     result = np.full(rows * columns, np.nan)
-    for block in range(rows * columns):
+    _move_blocks(
+        before, now, max_sigma_px, result, np.empty((4, 4)), np.empty((4, 4)), np.empty(4), np.empty(4), np.empty(4)
+    )
+    return result
+
+
+@uncounted()
+def _move_blocks(
+    before: Any, now: Any, max_sigma_px: float, result: Any,
+    normal: Any, factor: Any, right: Any, column: Any, solution: Any,
+) -> None:  # fmt: skip
+    columns = (before.shape[1] - 2) // BLOCK_PX
+    for block in range(len(result)):
         top, left = 1 + (block // columns) * BLOCK_PX, 1 + (block % columns) * BLOCK_PX
-        normal, right, square = np.zeros((4, 4)), np.zeros(4), 0.0
+        normal[:] = 0.0
+        right[:] = 0.0
+        square = 0.0
         contrast_before, contrast_now = 0.0, 0.0  # sums of squared gradients
-        column = np.empty(4)
         for y in range(top, top + BLOCK_PX):
             for x in range(left, left + BLOCK_PX):
                 # Gradients of both images' mean: displacements are then right to second order.
@@ -118,11 +132,14 @@ def block_motion_px(before: Any, now: Any, max_sigma_px: float) -> Any:
             continue
         for i in range(4):
             normal[i, i] += 1e-6 * (1.0 + normal[i, i])
-        solution = np.linalg.solve(normal, right)
-        left_over = max(square - (solution * right).sum(), 0.0) / BLOCK_PX**2
+        factorise(normal, 4, factor)
+        solve(factor, right, 4, solution)
+        explained = 0.0
+        for i in range(4):
+            explained += solution[i] * right[i]
+        left_over = max(square - explained, 0.0) / BLOCK_PX**2
         unexplained = max(left_over - 2.0 * SIGMA_GREY**2, 0.0) / (0.5 * (xx + yy) / BLOCK_PX**2)
         if unexplained > MAX_UNEXPLAINED_PX**2:
             result[block] = np.inf
         else:
             result[block] = np.hypot(solution[0], solution[1])
-    return result

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.geometry.small_cholesky import factorise, solve
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.scene.road_relief import NODE_M, Relief
 from mrasfm_engine.types import Floats, Ints
@@ -43,13 +44,22 @@ def fit_relief(foot_m: Floats, offset_m: Floats, sigma_m: Floats, *, roughness_m
     return Relief(node_m=node, height_m=plane[:, 0], slope=plane[:, 1:], sigma_m=sigma)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _fit_nodes(
     node: Any, foot: Any, offset: Any, variance: Any, away: Any, row: Any, plane: Any, sigma: Any, lo: int, hi: int
 ) -> None:
     """Fit the planes (n, 3) of nodes lo to hi, and their heights' standard deviations, to their nearest points."""
-    h, g, x = np.empty((3, 3)), np.empty(3), np.empty(3)
-    design = np.ones(3)
+    _fit_each(
+        node, foot, offset, variance, away, row, plane, sigma, lo, hi,
+        np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.ones(3),
+    )  # fmt: skip
+
+
+@uncounted()
+def _fit_each(
+    node: Any, foot: Any, offset: Any, variance: Any, away: Any, row: Any, plane: Any, sigma: Any, lo: int, hi: int,
+    h: Any, factor: Any, g: Any, x: Any, design: Any,
+) -> None:  # fmt: skip
     for n in range(lo, hi):
         reach = NODE_M / 2
         for a in range(away.shape[1]):
@@ -58,7 +68,8 @@ def _fit_nodes(
         reach *= 1.05  # the farthest one counts a little
         x[:] = 0.0
         for step in range(STEPS):
-            h[:], g[:] = 0.0, 0.0
+            h[:] = 0.0
+            g[:] = 0.0
             h[0, 0], h[1, 1], h[2, 2] = SIGMA_HEIGHT_M**-2, SIGMA_SLOPE**-2, SIGMA_SLOPE**-2
             for a in range(away.shape[1]):
                 if away[n, a] == np.inf:
@@ -73,9 +84,17 @@ def _fit_nodes(
                     g[p] += w * design[p] * offset[j]
                     for q in range(3):
                         h[p, q] += w * design[p] * design[q]
-            x[:] = np.linalg.solve(h, g)
+            factorise(h, 3, factor)  # positive by what the relief is where nothing tells
+            solve(factor, g, 3, x)
         # Where noise would make as much of it, there is no relief: shrunk as James and Stein (1961) do.
-        evidence = float(x @ h @ x)
-        plane[n] = x * (1.0 - CHANCE / evidence if evidence > CHANCE else 0.0)
+        evidence = 0.0
+        for p in range(3):
+            for q in range(3):
+                evidence += x[p] * h[p, q] * x[q]
+        left = 1.0 - CHANCE / evidence if evidence > CHANCE else 0.0
+        for p in range(3):
+            plane[n, p] = x[p] * left
         # Weights that fall with distance count a point as less precise than it is: the deviation is no smaller.
-        sigma[n] = math.sqrt(np.linalg.inv(h)[0, 0])
+        g[0], g[1], g[2] = 1.0, 0.0, 0.0
+        solve(factor, g, 3, x)
+        sigma[n] = math.sqrt(x[0])

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -74,8 +74,10 @@ def find_supported(
     return supported
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _level_from(start: float, offset: Any, weight: Any, variance: Any, count: int, own_variance: float) -> Any:
+@uncounted()
+def _level_from(
+    start: float, offset: Any, weight: Any, variance: Any, count: int, own_variance: float
+) -> tuple[float, float]:
     """The level that mean shift reaches from a start, with Tukey's weights, and its information; none has zero."""
     level, information = start, 0.0
     for _ in range(SHIFTS):
@@ -96,7 +98,7 @@ def _level_from(start: float, offset: Any, weight: Any, variance: Any, count: in
     return level, information
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@uncounted()
 def _has_majority(level: float, rival: float, count: int, dx: Any, dy: Any, offset: Any, weight: Any, variance: Any,
                   strip_m: float, sides: Any) -> bool:  # fmt: skip
     """Return whether, on one side of a point or in a strip through it, most neighbours are on a level."""
@@ -126,8 +128,19 @@ def _judge(
     sides: Any, supported: Any, lo: int, hi: int,
 ) -> None:  # fmt: skip
     """Judge points asked[lo] to asked[hi] by their neighbours (n, k), of which only those counted have a say."""
+    k = away.shape[1] + 1
+    _judge_each(
+        xy, offset, sigma, most, roughness, asked, away, index, counted, sides, supported, lo, hi,
+        np.empty(k), np.empty(k), np.empty(k), np.empty(k), np.empty(k),
+    )  # fmt: skip
+
+
+@uncounted()
+def _judge_each(
+    xy: Any, offset: Any, sigma: Any, most: Any, roughness: float, asked: Any, away: Any, index: Any, counted: Any,
+    sides: Any, supported: Any, lo: int, hi: int, z: Any, w: Any, v: Any, dx: Any, dy: Any,
+) -> None:  # fmt: skip
     k = away.shape[1]
-    z, w, v, dx, dy = np.empty(k + 1), np.empty(k + 1), np.empty(k + 1), np.empty(k + 1), np.empty(k + 1)
     rough = roughness * roughness
     for n in range(lo, hi):
         i, reach = asked[n], SMALLEST_REACH_M
