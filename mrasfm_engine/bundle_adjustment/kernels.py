@@ -170,7 +170,7 @@ def _squared_errors(
         out[n] = (proj[0] - observed.xy[n, 0]) ** 2 + (proj[1] - observed.xy[n, 1]) ** 2
 
 
-@uncounted()
+@uncounted(forceinline=True)
 def linearise(
     unit_r: Any, unit_t: Any, bands: Any, band: int, follows: bool, c: int, camera_is_free: bool,
     cam_r: Any, cam_t: Any, kind: int, k: Any, x: Any, xy: Any, loss: Loss,

@@ -17,7 +17,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.scene import PairMatches
@@ -163,13 +163,19 @@ def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats,
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True)
 def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
     """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
 
     The way is followed in straight steps between DEPTHS knots; those that the camera does not show are left out.
     """
-    work, proj = np.empty(6), np.empty(8)
+    _follow_paths(kind, params, rays, origin, deepest, xy_px, out, np.empty(6), np.empty(8))
+
+
+@uncounted()
+def _follow_paths(
+    kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any, work: Any, proj: Any
+) -> None:
     for i in range(len(rays)):
         best, before = np.inf, False
         u0, v0 = 0.0, 0.0

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.jit import njit
+from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.triangulation.track_motion import DRIFT_M_S, SPEED_M_S, TrackMotion
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Floats, Ints
@@ -54,6 +55,7 @@ def group(
     *,
     focal_px: Floats,
     weigh: Callable[[Ints], None],
+    threads: int = 1,
 ) -> MotionGroups:
     """Decide which tracks move.
 
@@ -71,11 +73,11 @@ def group(
         Completes `motion` for tracks.
     """
     weigh(suspects[np.isnan(motion.log_evidence[suspects])])
-    beside = _neighbours(suspects, motion, keypoints, tracks, focal_px)
+    beside = _neighbours(suspects, motion, keypoints, tracks, focal_px, threads)
     others = np.setdiff1d(beside[beside >= 0], suspects)
     weigh(others[np.isnan(motion.log_evidence[others])])
     nodes = np.concatenate([suspects, others])
-    edges = np.concatenate([beside, _neighbours(others, motion, keypoints, tracks, focal_px)])
+    edges = np.concatenate([beside, _neighbours(others, motion, keypoints, tracks, focal_px, threads)])
     place = np.full(len(tracks), -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
     # A neighbour that is no node stands: it is beside no suspect.
@@ -96,12 +98,21 @@ def group(
     return MotionGroups(tracks=nodes[order], reason=reason[order])
 
 
-def _neighbours(which: Ints, motion: TrackMotion, keypoints: Keypoints, tracks: Tracks, focal_px: Floats) -> Ints:
+def _neighbours(
+    which: Ints, motion: TrackMotion, keypoints: Keypoints, tracks: Tracks, focal_px: Floats, threads: int
+) -> Ints:
     """The tracks (n, NEIGHBOURS) nearest to tracks in the image of their reference keypoints; -1 for none."""
     result = np.full((len(which), NEIGHBOURS), -1, dtype=np.int64)
     reference = motion.reference[which]
     reach_px = REACH_M * focal_px[keypoints.camera[reference]] / motion.distance_m[which]
-    _nearest(reference, reach_px, keypoints.first, keypoints.image, keypoints.xy_px, tracks.of_keypoint, result)
+    in_ranges(
+        threads,
+        len(which),
+        lambda lo, hi: _nearest(
+            reference[lo:hi], reach_px[lo:hi], keypoints.first, keypoints.image, keypoints.xy_px, tracks.of_keypoint,
+            result[lo:hi],
+        ),
+    )  # fmt: skip
     return result
 
 

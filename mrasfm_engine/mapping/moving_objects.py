@@ -64,7 +64,10 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
     suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
 
     def moving(suspects: Ints, known: Floats) -> MotionGroups:
-        return group(motion, suspects, known, mapper.keypoints, mapper.tracks, focal_px=focal_px, weigh=weigh)
+        return group(
+            motion, suspects, known, mapper.keypoints, mapper.tracks,
+            focal_px=focal_px, weigh=weigh, threads=mapper.config.threads,
+        )  # fmt: skip
 
     found = moving(suspects, np.full(len(mapper.tracks), np.nan))
     known = log_odds_in_single_units(mapper, _among(found.tracks, may_move), path)

@@ -15,7 +15,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project
-from mrasfm_engine.jit import njit
+from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Floats, Ints
 
 SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other, where nothing else is known
@@ -85,15 +85,25 @@ def pose_information(
     return square * UNWEIGHTED_PX**2
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "arcp"})
+@njit(cache=True, nogil=True)
 def _pose_system(
     r: Any, t: Any, view_r: Any, view_t: Any, kind: Any, params: Any, view: Any, xy: Any, points: Any, sigma: float,
     square: Any, gradient: Any,
 ) -> None:  # fmt: skip
     """J'WJ (6, 6) and J'Wr (6,) in steps [omega, tau] of the pose, as in `adjustment.normal_equations`."""
+    _add_observations(
+        r, t, view_r, view_t, kind, params, view, xy, points, sigma, square, gradient,
+        np.empty(6), np.empty(8), np.empty(3), np.empty(3), np.empty(3), np.empty(6),
+    )  # fmt: skip
+
+
+@uncounted()
+def _add_observations(
+    r: Any, t: Any, view_r: Any, view_t: Any, kind: Any, params: Any, view: Any, xy: Any, points: Any, sigma: float,
+    square: Any, gradient: Any, work: Any, proj: Any, d: Any, rig: Any, n: Any, j: Any,
+) -> None:  # fmt: skip
     square[:] = 0.0
     gradient[:] = 0.0
-    work, proj, d, rig, n, j = np.empty(6), np.empty(8), np.empty(3), np.empty(3), np.empty(3), np.empty(6)
     for k in range(len(view)):
         e = view[k]
         for i in range(3):
