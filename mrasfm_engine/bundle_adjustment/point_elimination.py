@@ -108,11 +108,9 @@ def accumulate(
     dof = 6 + len(free_slots.inner)
     most = _most_blocks(groups.first_block)
     w = np.empty((most, 3, dof))  # coupling of a point to its blocks, transposed
-    # W_j and W_i V^-1, spread over blocks' entries
-    tiled, repeated = np.empty((most, 3 * 6 * dof)), np.empty(3 * 6 * dof)
     _accumulate(
         views, bands, motion, points, observed, obs_image, free_slots, groups, loss, damping, lo, hi, sums,
-        workspace(dof), np.empty(6), np.empty(6), np.empty(3), w, tiled, repeated,
+        workspace(dof), np.empty(6), np.empty(6), np.empty(3), w, np.empty((dof, 3)),
     )  # fmt: skip
 
 
@@ -120,7 +118,7 @@ def accumulate(
 def _accumulate(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, obs_image: Any,
     free_slots: Slots, groups: Groups, loss: Loss, damping: float, lo: int, hi: int, sums: Sums,
-    memory: Any, v: Any, inv: Any, e: Any, w: Any, tiled: Any, repeated: Any,
+    memory: Any, v: Any, inv: Any, e: Any, w: Any, y: Any,
 ) -> None:  # fmt: skip
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
@@ -173,8 +171,8 @@ def _accumulate(
             v_inverse[p, i] = inv[i]
         _subtract_gradient(w, inv, e, blocks, b0, b1, num_units, dof, g)
         _subtract_products(
-            w, inv, tiled, repeated, blocks, b0, b1, num_units, inner_places,
-            places, first_place[group], s_units, s_border, s_cameras,
+            w, inv, y, blocks, b0, b1, num_units, inner_places, places, first_place[group],
+            s_units, s_border, s_cameras,
         )  # fmt: skip
 
 
@@ -254,44 +252,43 @@ def _subtract_gradient(
 
 @uncounted()
 def _subtract_products(
-    w: Any, inv: Any, tiled: Any, repeated: Any, blocks: Any, b0: int, b1: int, num_units: int,
-    inner_places: Any, places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,
+    w: Any, inv: Any, y: Any, blocks: Any, b0: int, b1: int, num_units: int, inner_places: Any,
+    places: Any, place: int, s_units: Any, s_border: Any, s_cameras: Any,
 ) -> None:  # fmt: skip
-    """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks.
-
-    Entry (a, b) of a product needs row a of W_i V^-1 and row b of W_j. Both are first spread over the 6 columns of a
-    block, so that one loop without gaps runs over all of its entries.
-    """
+    """S_ij -= W_i V^-1 W_j' for all pairs of a point's blocks."""
     dof = 6 + len(inner_places)
-    count, wide = b1 - b0, 6 * dof
-    for i in range(count):
+    for i in range(b1 - b0):
         block = blocks[b0 + i]
-        rows = 6 if block < num_units else dof
-        for a in range(rows):
-            x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
-            y0, y1, y2 = multiply3(inv, x0, x1, x2)
-            for k in range(6 * a, 6 * a + 6):
-                repeated[k], repeated[wide + k], repeated[2 * wide + k] = y0, y1, y2
-        if rows == 6:
-            for a in range(6):
-                x0, x1, x2 = w[i, 0, a], w[i, 1, a], w[i, 2, a]
-                for k in range(a, wide, 6):
-                    tiled[i, k], tiled[i, wide + k], tiled[i, 2 * wide + k] = x0, x1, x2
-        entries = 6 * rows
+        for a in range(6 if block < num_units else dof):
+            y[a, 0], y[a, 1], y[a, 2] = multiply3(inv, w[i, 0, a], w[i, 1, a], w[i, 2, a])
         for j in range(i + 1):
             other = blocks[b0 + j]
-            if other >= num_units:
+            if block < num_units:
+                _subtract_product(y, 6, w, j, s_units, places[place + i * (i + 1) // 2 + j])
+            elif other < num_units:
+                _subtract_product(y, dof, w, j, s_border[block - num_units], other)
+            else:
                 target = s_cameras[block - num_units, other - num_units]
                 for a in range(dof):
-                    y0, y1, y2 = repeated[6 * a], repeated[wide + 6 * a], repeated[2 * wide + 6 * a]
                     for b in range(dof):
-                        target[dof * a + b] -= y0 * w[j, 0, b] + y1 * w[j, 1, b] + y2 * w[j, 2, b]
-                continue
-            target = s_units[places[place + i * (i + 1) // 2 + j]] if rows == 6 else s_border[block - num_units, other]
-            source = tiled[j]
-            for k in range(entries):
-                target[k] -= (
-                    repeated[k] * source[k]
-                    + repeated[wide + k] * source[wide + k]
-                    + repeated[2 * wide + k] * source[2 * wide + k]
-                )
+                        target[dof * a + b] -= y[a, 0] * w[j, 0, b] + y[a, 1] * w[j, 1, b] + y[a, 2] * w[j, 2, b]
+
+
+@uncounted(forceinline=True)
+def _subtract_product(y: Any, rows: int, w: Any, j: int, out: Any, at: int) -> None:
+    """Subtract Y W_j' (rows, 6) from the block out[at], which holds its entries row by row.
+
+    All of W_j is read before the first row is written: written out like this, LLVM keeps it in vector registers, as
+    it need not ask whether the block is a part of it.
+    """
+    a0, a1, a2, a3, a4, a5 = w[j, 0, 0], w[j, 0, 1], w[j, 0, 2], w[j, 0, 3], w[j, 0, 4], w[j, 0, 5]
+    b0, b1, b2, b3, b4, b5 = w[j, 1, 0], w[j, 1, 1], w[j, 1, 2], w[j, 1, 3], w[j, 1, 4], w[j, 1, 5]
+    c0, c1, c2, c3, c4, c5 = w[j, 2, 0], w[j, 2, 1], w[j, 2, 2], w[j, 2, 3], w[j, 2, 4], w[j, 2, 5]
+    for row in range(rows):
+        y0, y1, y2, k = y[row, 0], y[row, 1], y[row, 2], 6 * row
+        out[at, k] -= y0 * a0 + y1 * b0 + y2 * c0
+        out[at, k + 1] -= y0 * a1 + y1 * b1 + y2 * c1
+        out[at, k + 2] -= y0 * a2 + y1 * b2 + y2 * c2
+        out[at, k + 3] -= y0 * a3 + y1 * b3 + y2 * c3
+        out[at, k + 4] -= y0 * a4 + y1 * b4 + y2 * c4
+        out[at, k + 5] -= y0 * a5 + y1 * b5 + y2 * c5
