@@ -52,24 +52,19 @@ def log_so3(rotation: ArrayLike) -> Floats:
 def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
     """Unit quaternions (..., 4), x y z w, w >= 0 up to rounding, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=np.float64)
-    d = np.stack([r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]], -1)
+    d = np.diagonal(r, axis1=-2, axis2=-1)
     trace = d.sum(-1)
-    # Shepperd's method: of the four ways to divide, the one by the largest component.
-    squares = np.concatenate([1 + 2 * d - trace[..., None], (1 + trace)[..., None]], -1)
+    # Shepperd's method: each row is the quaternion times four times one of its components, of which the largest serves.
+    rows = np.empty((*r.shape[:-2], 4, 4))
+    rows[..., :3, :3] = r + np.swapaxes(r, -1, -2)
+    squares = np.einsum("...ii->...i", rows)  # a view
+    squares[..., :3] = 2 * d + (1 - trace)[..., None]
+    squares[..., 3] = 1 + trace
+    for i, j, k in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
+        rows[..., i, 3] = rows[..., 3, i] = r[..., j, k] - r[..., k, j]
     largest = squares.argmax(-1)
-    c = np.stack([r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1)
-    s = r + np.swapaxes(r, -1, -2)
-    rows = np.stack(
-        [
-            np.stack([squares[..., 0], s[..., 0, 1], s[..., 0, 2], c[..., 0]], -1),
-            np.stack([s[..., 0, 1], squares[..., 1], s[..., 1, 2], c[..., 1]], -1),
-            np.stack([s[..., 0, 2], s[..., 1, 2], squares[..., 2], c[..., 2]], -1),
-            np.stack([c[..., 0], c[..., 1], c[..., 2], squares[..., 3]], -1),
-        ],
-        -2,
-    )
     q = np.take_along_axis(rows, largest[..., None, None], -2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = q / np.sqrt((q * q).sum(-1, keepdims=True))
     result: Floats = np.where(q[..., 3:] < 0, -q, q)
     return result
 
