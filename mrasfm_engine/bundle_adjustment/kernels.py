@@ -147,16 +147,14 @@ def squared_errors(
     views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any
 ) -> None:
     """Squared reprojection errors in pixels of observations lo..hi; BEHIND_PX squared of points not seen."""
-    _squared_errors(
-        views, bands, points, observed, lo, hi, out, np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8)
-    )
+    _squared_errors(views, bands, points, observed, lo, hi, out, workspace(6))
 
 
 @uncounted()
 def _squared_errors(
-    views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any,
-    d: Any, rig: Any, cam: Any, work: Any, proj: Any,
-) -> None:  # fmt: skip
+    views: Views, bands: Bands | None, points: Any, observed: Observed, lo: int, hi: int, out: Any, memory: Any
+) -> None:
+    d, rig, cam, work, proj, _, _, _ = memory
     for n in range(lo, hi):
         u, c = observed.unit[n], observed.camera[n]
         band = 0 if bands is None else bands.of_observation[n]

@@ -163,17 +163,15 @@ def point_costs(
     views: Views, bands: Bands | None, points: Any, observed: Observed, scale2: float, lo: int, hi: int, costs: Any
 ) -> None:
     """Compute the cost of points lo..hi: sums of log(1 + r^2 / scale^2) over their observations."""
-    _point_costs(
-        views, bands, points, observed, scale2, lo, hi, costs,
-        np.empty(3), np.empty(3), np.empty(3), np.empty(6), np.empty(8),
-    )  # fmt: skip
+    _point_costs(views, bands, points, observed, scale2, lo, hi, costs, workspace(6))
 
 
 @uncounted()
 def _point_costs(
     views: Views, bands: Bands | None, points: Any, observed: Observed, scale2: float, lo: int, hi: int, costs: Any,
-    d: Any, rig: Any, cam: Any, work: Any, proj: Any,
+    memory: Any,
 ) -> None:  # fmt: skip
+    d, rig, cam, work, proj, _, _, _ = memory
     for p in range(lo, hi):
         costs[p] = _point_cost(
             views, bands, observed, observed.first[p], observed.first[p + 1], scale2, points[p],

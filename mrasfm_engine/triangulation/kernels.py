@@ -269,14 +269,13 @@ def _triangulate_tracks(
 @njit(cache=True, nogil=True)
 def reprojection_errors2(rows: Any, point: Any, posed: PosedKeypoints, points: Any, out: Any) -> None:
     """Write squared reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) into `out`."""
-    _reprojection_errors2(rows, point, posed, points, out, np.empty(3), np.empty(6), np.empty(8))
+    _reprojection_errors2(rows, point, posed, points, out, _room_for_work())
 
 
 @uncounted()
-def _reprojection_errors2(
-    rows: Any, point: Any, posed: PosedKeypoints, points: Any, out: Any, cam: Any, distorted: Any, projected: Any
-) -> None:
+def _reprojection_errors2(rows: Any, point: Any, posed: PosedKeypoints, points: Any, out: Any, work: Work) -> None:
     band, camera, xy, _, r, t, kind, params = posed
+    cam, distorted, projected, _, _, _ = work
     for n in range(len(rows)):
         k = rows[n]
         b, of = band[k], camera[k]
