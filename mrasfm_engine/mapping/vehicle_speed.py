@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.matching.motion_of_cameras import USUAL_SPEED_MPS
 from mrasfm_engine.types import Floats
 
 MAX_SPEED_MPS = 70.0  # 250 km/h: cars that map roads drive no faster
-USUAL_SPEED_MPS = 8.0  # 30 km/h: of walking pace and of a motorway, neither is a factor of six away
 
 
 def speeds_mps(mapper: Mapper) -> Floats:

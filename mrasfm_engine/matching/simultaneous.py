@@ -92,7 +92,7 @@ def contradiction(names: Sequence[str], given: Floats, rig: RigEstimate) -> Find
     is_contradicted = rig.matches and rig.fitted_as_given < CLEARLY_GIVEN <= rig.fitted
     if not (is_contradicted or rig.is_far):
         return None
-    between_deg = np.degrees(_turned_between(given, rig.rig_from_cam))
+    between_deg = np.degrees(turned_between(given, rig.rig_from_cam))
     a, b = sorted(int(k) for k in np.unravel_index(int(between_deg.argmax()), between_deg.shape))
     return warning(
         "calibration-contradicted",
@@ -316,7 +316,7 @@ def _stands(problem: _RigProblem, refined: Floats, moved: Floats, max_error_px: 
         return False
     if fitted < WELL_FITTED and (fitted < CLEARLY_GIVEN or fitted < given + GAIN):
         return False
-    turned = _turned_between(problem.rig_from_cam, refined)
+    turned = turned_between(problem.rig_from_cam, refined)
     for one, far, share in zip(problem.found, problem.are_far(refined), after, strict=True):
         a, b = one.camera_a, one.camera_b
         if far and (share < FITTED_FAR or turned[a, b] > largest_turn_rad(*problem.sigma_rad[[3 * a, 3 * b]])):
@@ -324,7 +324,7 @@ def _stands(problem: _RigProblem, refined: Floats, moved: Floats, max_error_px: 
     return True
 
 
-def _turned_between(given: Floats, rig_from_cam: Floats) -> Floats:
+def turned_between(given: Floats, rig_from_cam: Floats) -> Floats:
     """Angles (c, c) in rad by which two cameras are turned against one another from where they were given."""
     turned = rig_from_cam[:, :3, :3] @ np.swapaxes(given[:, :3, :3], 1, 2)
     result: Floats = np.linalg.norm(se3.log_so3(np.swapaxes(turned, 1, 2)[:, None] @ turned[None]), axis=-1)
@@ -389,7 +389,7 @@ class _RigProblem:
 
     def are_far(self, rig_from_cam: Floats) -> Bools:
         """Pairs of cameras (pairs,) that are turned against one another by many sigmas."""
-        turned = _turned_between(self.rig_from_cam, rig_from_cam)
+        turned = turned_between(self.rig_from_cam, rig_from_cam)
         sigma = self.sigma_rad[::3]
         return np.array(
             [
