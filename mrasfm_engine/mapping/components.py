@@ -38,6 +38,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats, Ints
+from schemas.findings import Finding
 
 # Two units are a seed; that a third one agrees with their points is the least that confirms it.
 MIN_UNITS = 3
@@ -123,7 +124,7 @@ def begin_mapping(
 ) -> DriveMapping:
     """Mapping of a drive of which nothing has a pose yet."""
     near, far = split_pairs(pairs)
-    mapper, still = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
+    mapper, still, contradiction = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
     return DriveMapping(
         mapper=mapper,
         still=still,
@@ -132,6 +133,7 @@ def begin_mapping(
         sound=without_keypoints(near, keypoints.first, still) if still.any() else near,
         prior_world_from_rig=prior_world_from_rig,
         absolute=AbsolutePriors() if absolute is None else absolute,
+        contradiction=contradiction,
         progress=progress,
         cancel=cancel,
     )
@@ -151,6 +153,8 @@ class DriveMapping:
         Pairs of units that follow one another, and of those that may be revisits.
     sound
         Those of `near` without the keypoints that stand still.
+    contradiction
+        What the cameras' motions have against the calibration as given.
     parts
         What has grown so far.
     """
@@ -162,6 +166,7 @@ class DriveMapping:
     sound: Sequence[PairMatches]
     prior_world_from_rig: Floats | None
     absolute: AbsolutePriors
+    contradiction: Finding | None
     progress: CountProgress | None
     cancel: Cancel | None
     parts: list[Component] = field(default_factory=list)
@@ -208,6 +213,7 @@ class DriveMapping:
             if not result or part.size >= MIN_UNITS:
                 taken |= part.mapper.registered
                 result.append(part)
+        result[0].log.contradiction = self.contradiction
         return result
 
 

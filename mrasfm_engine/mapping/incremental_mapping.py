@@ -29,12 +29,14 @@ from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.static_images import find_still_keypoints
 from mrasfm_engine.mapping.unit_registration import Registration, register_unit
+from mrasfm_engine.matching.motion_of_cameras import motion_contradiction
 from mrasfm_engine.matching.relative_pose import UncertainRig
 from mrasfm_engine.matching.simultaneous import calibration_sigmas, verified_again
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints, build_tracks
 from mrasfm_engine.types import Bools, Cancel, CountProgress, Floats, Ints
+from schemas.findings import Finding
 
 LOCAL_TOLERANCE = 1e-3
 GLOBAL_TOLERANCE = 1e-4
@@ -58,6 +60,7 @@ class MappingLog:
     revisits: list[tuple[int, int]] = field(default_factory=list)  # those that were believed
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
     verified_again: bool = False  # whether matches within units were judged anew, by a calibration that had moved
+    contradiction: Finding | None = None  # of the calibration as given by how the cameras move
     covered_images: dict[int, float] = field(default_factory=dict)  # by image, the share of keypoints that move along
 
 
@@ -126,22 +129,25 @@ def mapper_of_drive(
     pairs: Sequence[PairMatches],
     prior_world_from_rig: Floats | None,
     config: EngineConfig,
-) -> tuple[Mapper, Bools]:
+) -> tuple[Mapper, Bools, Finding | None]:
     """The mapper of a drive of which nothing is registered yet, with tracks of pairs of units that follow one another.
 
-    Also the keypoints (k,) that stand still in the image while the car moves, which its tracks do without.
+    Also the keypoints (k,) that stand still in the image while the car moves, which its tracks do without, and what the
+    cameras' motions have against the calibration as given.
     """
     image_unit = np.array([image.unit for image in drive.images], dtype=np.int64)
     image_camera = np.array([image.camera for image in drive.images], dtype=np.int64)
     still = find_still_keypoints(keypoints, image_unit, image_camera, drive.rig_from_cam, pairs)
     sound = without_keypoints(pairs, keypoints.first, still) if still.any() else pairs
     mapper = Mapper(drive, keypoints, build_tracks(keypoints, sound), config)
+    contradiction = None
     if config.bundle_adjustment.reassessment:
-        mapper.correct_calibration(sound)
+        by_motion = mapper.correct_calibration(sound)
+        contradiction = motion_contradiction([camera.name for camera in drive.cameras], drive.rig_from_cam, by_motion)
     mapper.keyframe = select_keyframes(mapper)
     if prior_world_from_rig is not None:
         mapper.motion.follow_prior(prior_world_from_rig)
-    return mapper, still
+    return mapper, still, contradiction
 
 
 def cleaned_and_closed(

@@ -19,6 +19,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.mapping.rig_motion import RigMotion
 from mrasfm_engine.mapping.visibility_pyramid import finest_cells, visibility_score
+from mrasfm_engine.matching.motion_of_cameras import MotionEstimate, rig_by_motion
 from mrasfm_engine.matching.simultaneous import rig_of_drive
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
@@ -149,16 +150,23 @@ class Mapper:
         a, b = first[pair.image_a] + pair.matches[:, 0], first[pair.image_b] + pair.matches[:, 1]
         return self.keypoints.rays[a], self.keypoints.rays[b]
 
-    def correct_calibration(self, pairs: Sequence[PairMatches]) -> None:
-        """Begin with the calibration as simultaneous images correct it, see `matching.simultaneous`."""
+    def correct_calibration(self, pairs: Sequence[PairMatches]) -> MotionEstimate:
+        """Begin with the calibration as simultaneous images correct it, and then the cameras' motions.
+
+        See `matching.simultaneous` and `matching.motion_of_cameras`, whose result this returns.
+        """
 
         def inlier_rays_of(pair: PairMatches) -> tuple[Floats, Floats]:
             a, b = self.rays_of(pair)
             return a[pair.inliers], b[pair.inliers]
 
         rig = rig_of_drive(self.drive, pairs, inlier_rays_of, self.config.matching, self.config.bundle_adjustment)
-        self.rig_as_begun = rig.rig_from_cam
+        by_motion = rig_by_motion(
+            self.drive, pairs, inlier_rays_of, rig, self.config.matching, self.config.bundle_adjustment
+        )
+        self.rig_as_begun = by_motion.rig_from_cam
         self.begin_anew(np.ones(len(self.camera_kind), dtype=np.bool_))
+        return by_motion
 
     def begin_anew(self, cameras: Bools) -> None:
         """Put cameras (c,) back to where they were before the first adjustment."""

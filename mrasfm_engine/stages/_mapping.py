@@ -101,6 +101,7 @@ def described(parts: Sequence[Component]) -> dict[str, Any]:
         "findings": [
             as_json(finding)
             for finding in [
+                *([] if parts[0].log.contradiction is None else [parts[0].log.contradiction]),
                 *gaps.findings(parts),
                 *mapping_report.covered_camera_findings(parts[0].mapper, parts[0].log),
             ]
