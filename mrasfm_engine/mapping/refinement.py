@@ -240,7 +240,11 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
     result.certainty = certainty_of(mapper, result)
     if result.certainty is not None and not result.georeferenced and not mapper.drive.has_single_camera:
         result.certainty = with_other_sizes(
-            mapper, result.certainty, lambda: _adjust_all_cameras(mapper, result, free_units, cancel)
+            mapper,
+            result.certainty,
+            lambda terms: _adjust_all_cameras(mapper, result, free_units, terms, cancel),
+            lambda: terms_of_all_cameras(mapper, result),
+            solver_options(mapper, result),
         )
     _compare_rough_poses_with_rig(mapper, result)
     result.directions = observed_directions(mapper, result.certainty)
@@ -345,14 +349,16 @@ def _adjust(
     _rescale(mapper, result, terms)
 
 
-def _adjust_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> Report:
-    """Adjust with all cameras and their times free under their priors, those that are held as well."""
+def _adjust_all_cameras(
+    mapper: Mapper, result: Refinement, free_units: Bools, terms: Sequence[Term], cancel: Cancel | None
+) -> Report:
+    """Adjust by some terms with all cameras and their times free under their priors, those that are held as well."""
     return adjust_poses(
         mapper,
         free_units & mapper.registered,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
         free_times=np.full(len(mapper.camera_kind), times_may_vary(mapper)),
-        terms=terms_of_all_cameras(mapper, result),
+        terms=terms,
         options=solver_options(mapper, result),
         cancel=cancel,
     )

@@ -1,17 +1,19 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.calibration import calibration_prior, scale_scene
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.other_sizes import FACTORS, UNSURE, with_other_sizes
+from mrasfm_engine.mapping.other_sizes import FACTORS, UNSURE, scenes_of_sizes, size_m, with_other_sizes
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from tests.unit.mapping.test_calibration import UNITS, true_model
 
@@ -30,20 +32,19 @@ def assessed(mapper: Mapper, sigma_scale: float) -> tuple[Covariances, int]:
 
     adjustments: list[Report] = []
 
-    def adjust() -> Report:
-        report = adjust_poses(
-            mapper, FREE, free_cameras=np.ones(2, dtype=np.bool_), terms=[calibration_prior(mapper)], options=OPTIONS
+    def adjust(terms: Sequence[Term]) -> None:
+        adjustments.append(
+            adjust_poses(mapper, FREE, free_cameras=np.ones(2, dtype=np.bool_), terms=terms, options=OPTIONS)
         )
-        adjustments.append(report)
-        return report
 
-    return with_other_sizes(mapper, certainty, adjust), len(adjustments)
+    return with_other_sizes(mapper, certainty, adjust, lambda: [calibration_prior(mapper)], OPTIONS), len(adjustments)
 
 
 def test_a_scene_that_costs_the_same_at_other_sizes_is_as_uncertain_as_these_are_apart() -> None:
     """One of two cameras sees nothing: images of the other say nothing of how large the scene is."""
     mapper = true_model(cameras=2)
-    mapper.is_inlier[mapper.keypoints.camera == 1] = False
+    mapper.missing[mapper.image_camera == 1] = True
+    mapper.complete()
     state, motion, before = mapper.state, mapper.motion, mapper.state.unit_position_m.copy()
     found, _ = assessed(mapper, sigma_scale=0.1)
     assert found.sigma_scale == pytest.approx(np.log(max(FACTORS)), rel=0.2)
@@ -54,14 +55,44 @@ def test_a_scene_that_costs_the_same_at_other_sizes_is_as_uncertain_as_these_are
 
 def test_a_scene_that_comes_back_from_other_sizes_is_as_certain_as_it_was() -> None:
     found, adjusted = assessed(true_model(cameras=2), sigma_scale=0.1)
-    assert adjusted == 1 + len(FACTORS)
+    assert adjusted == 2 * (1 + len(FACTORS))
     assert found.sigma_scale == pytest.approx(0.1, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.5, 3.0])
+def test_observations_that_a_wrong_size_has_lost_count_against_it(factor: float) -> None:
+    """Those that are left fit as well as those of the true scene: a pair compares them with its baseline."""
+    mapper = true_model(cameras=2)
+    found_m, observations = size_m(mapper), int(mapper.is_inlier.sum())
+    scale_scene(mapper, factor)
+    mapper.complete()
+    assert mapper.is_inlier.sum() < 0.9 * observations
+    inlier = mapper.is_inlier.copy()
+    scenes = scenes_of_sizes(mapper, (1.0, 1.0 / factor), lambda terms: None, list, OPTIONS)
+    np.testing.assert_array_equal(mapper.is_inlier, inlier)
+    np.testing.assert_allclose(scenes.size_m, [factor * found_m, found_m], rtol=0.01)
+    assert scenes.cost[1] < 0.9 * scenes.cost[0]
+    assert scenes.sigma_of_scale(size_m(mapper)) == pytest.approx(abs(np.log(factor)), rel=0.01)
+    assert scenes.sigma_of_scale(found_m) < 0.1
+    scenes.take_best(mapper)
+    assert size_m(mapper) == pytest.approx(found_m, rel=0.01)
+    assert mapper.is_inlier.sum() == pytest.approx(observations, rel=0.01)
+
+
+def test_tracks_that_were_dropped_for_what_they_show_come_back_at_no_size() -> None:
+    mapper = true_model(cameras=2)
+    tracks = np.flatnonzero(mapper.triangulated)[::3]
+    mapper.drop(tracks)
+    scenes_of_sizes(mapper, (1.0, 2.0), lambda terms: None, list, OPTIONS).take_best(mapper)
+    assert mapper.rejected[tracks].all()
+    assert not mapper.is_inlier[np.isin(mapper.tracks.of_keypoint, tracks)].any()
 
 
 @pytest.mark.parametrize("sigma_scale", [0.5 * UNSURE, np.inf])
 def test_other_sizes_are_tried_only_where_images_know_the_scale_badly(sigma_scale: float) -> None:
     mapper = true_model(cameras=2)
-    mapper.is_inlier[mapper.keypoints.camera == 1] = False
+    mapper.missing[mapper.image_camera == 1] = True
+    mapper.complete()
     found, adjusted = assessed(mapper, sigma_scale=sigma_scale)
     assert (found.sigma_scale, adjusted) == (sigma_scale, 0)
 
@@ -80,11 +111,11 @@ def test_a_cancelled_trial_leaves_the_scene_as_it_was() -> None:
     mapper = true_model(cameras=2)
     state, motion = mapper.state, mapper.motion
 
-    def cancelled() -> Report:
+    def cancelled(terms: Sequence[Term]) -> None:
         raise CancelledError
 
     certainty, _ = assessed(mapper, sigma_scale=np.inf)
     with pytest.raises(CancelledError):
-        with_other_sizes(mapper, replace(certainty, sigma_scale=0.1), cancelled)
+        with_other_sizes(mapper, replace(certainty, sigma_scale=0.1), cancelled, list, OPTIONS)
     assert mapper.state is state
     assert mapper.motion is motion
