@@ -16,7 +16,7 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import place_by_gnss, positions_of_units, reassess_positions
+from mrasfm_engine.mapping.placement import factor_by_gnss, place_by_gnss, positions_of_units, reassess_positions
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
 from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -106,6 +106,10 @@ class AbsolutePriors:
                 mapper, self.rough_world_from_rig, sigma.sigma_translation_m
             )
         self._renew_rough(mapper)
+
+    def factor_by_positions(self, mapper: Mapper) -> float:
+        """Factor, about, by which the scene has to grow to be as long as the receiver says; 1 without a receiver."""
+        return 1.0 if self.gnss is None else factor_by_gnss(mapper, self.gnss)
 
     def doubt_the_rig(self, mapper: Mapper) -> None:
         """Take the scale of positions that contradict nothing but the rig's baselines, where these may vary."""

@@ -92,7 +92,7 @@ def place_by_gnss(
             reason="with latitude and longitude swapped the receiver's trajectory has the rig's length, as given not"
         )
     if len(units) > 1 and (single or rig_may_be_wrong or sigma_scale > UNKNOWN_SIGMA_SCALE):
-        factor = extent_m(known.position_m[units]) / extent_m(mapper.state.unit_position_m[units])
+        factor = _factor_on_extent(mapper, units, known)
         scale = scale_with_baselines if single or rig_may_be_wrong else scale_scene
         bound = np.inf if single or rig_may_be_wrong else sigma_rig_scale
         alignment = _with_receivers_scale(mapper, lambda: align(known), factor, scale, sigma_rig_scale=bound)
@@ -317,6 +317,17 @@ def _fits_swapped(
         sigma_rig_scale=sigma_rig_scale,
         rng=np.random.default_rng(mapper.config.seed),
     )
+
+
+def factor_by_gnss(mapper: Mapper, gnss: GnssTrack) -> float:
+    """Factor, about, by which the scene has to grow for its units to be as far apart as the receiver says."""
+    known = _positions_m(mapper, gnss)
+    units = np.flatnonzero(mapper.registered & np.isfinite(known.position_m[:, 0]))
+    return _factor_on_extent(mapper, units, known) if len(units) > 1 else 1.0
+
+
+def _factor_on_extent(mapper: Mapper, units: Ints, known: _Known) -> float:
+    return extent_m(known.position_m[units]) / extent_m(mapper.state.unit_position_m[units])
 
 
 def extent_m(position_m: Floats) -> float:

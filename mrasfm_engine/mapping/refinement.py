@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import (
-    MAX_UNKNOWNS_FOR_COVARIANCE,
     covariances,
 )
 from mrasfm_engine.bundle_adjustment.priors import Term
@@ -25,7 +24,6 @@ from mrasfm_engine.mapping.calibration import (
     observed_directions,
     resolve_scale,
     scale_of_baselines,
-    sigma_scale_of_images,
     take_calibration,
 )
 from mrasfm_engine.mapping.georeferencing import BENT
@@ -54,6 +52,7 @@ from mrasfm_engine.mapping.refinement_result import (
     terms_of,
     terms_of_all_cameras,
 )
+from mrasfm_engine.mapping.refused_positions import compare_positions_again
 from mrasfm_engine.mapping.road import drop_off_road, road_where_points_are
 from mrasfm_engine.mapping.time_offsets import (
     assess_times,
@@ -108,8 +107,9 @@ def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel
     """Put the scene where positions or rough poses say, and take the calibration of a larger scene, if there is one."""
     absolute = result.absolute
     absolute.place(mapper)
-    if absolute.positions_are_refused:
-        _compare_positions_again(mapper, result, cancel)
+    compares_again = _reassesses(mapper) and mapper.config.bundle_adjustment.camera_set_adjustment
+    if absolute.positions_are_refused and compares_again and not mapper.drive.has_single_camera:
+        compare_positions_again(mapper, result, cancel)
     if calibrated is None:
         absolute.doubt_the_rig(mapper)
     placed = result.georeferenced or result.placed_by_rough_poses
@@ -291,34 +291,6 @@ def _compare_rough_poses_with_rig(mapper: Mapper, result: Refinement) -> None:
     off = abs(float(np.log(factor)))
     if off > BOTH_RIGHT_SIGMAS * np.hypot(sigma_rig, result.certainty.sigma_scale):
         result.certainty = result.certainty.with_scale_error(off)
-
-
-def _compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel | None) -> None:
-    """Adjust by the images and the rig as given, and compare positions that were refused with that scene.
-
-    While the scene grows, damping holds up a scale that images hardly observe, and right positions contradict it.
-    """
-    settings, absolute = mapper.config.bundle_adjustment, result.absolute
-    if mapper.drive.has_single_camera or not (_reassesses(mapper) and settings.camera_set_adjustment):
-        return
-    result.sigma_px = observation_sigma_px(mapper)
-    free_units, options = free_units_of(mapper, absolute), solver_options(mapper, result)
-    terms = absolute.terms(mapper)
-    result.adjustments.append(adjust_poses(mapper, free_units, terms=terms, options=options, cancel=cancel))
-    mapper.complete()
-    terms = [calibration_prior(mapper), *terms]
-    problem, _ = mapper.problem(
-        free_units, free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_), terms=terms, options=options
-    )
-    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
-        return
-    # At no solution: of few units, what a wrong camera leaves in each passes for an error that they share.
-    certainty = covariances(problem, problem.state, shared_errors=not has_few_units(mapper))
-    sigma_scale = sigma_scale_of_images(mapper, certainty)
-    if not np.isfinite(sigma_scale):
-        return
-    lens = scale_of_given_rotations(mapper, free_units=free_units, free_times=None, terms=terms, options=options)
-    absolute.place(mapper, sigma_scale=float(np.hypot(sigma_scale, 0.0 if lens is None else lens.sigma_scale)))
 
 
 def _adjust(

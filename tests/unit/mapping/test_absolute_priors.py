@@ -200,6 +200,42 @@ def test_positions_that_contradict_the_scale_of_a_growing_scene_are_compared_wit
     assert 0.99 < scale < 1.01
 
 
+def turned_about_every_axis(rig_from_cam: np.ndarray, *, by_deg: float, seed: int) -> np.ndarray:
+    sign = np.random.default_rng(seed).choice([-1, 1], (len(rig_from_cam), 3))
+    rig_from_cam[:, :3, :3] = rig_from_cam[:, :3, :3] @ se3.exp_so3(np.radians(by_deg) * sign)
+    return rig_from_cam
+
+
+@pytest.mark.parametrize(
+    "drive",  # cameras, units, metres, degrees by which cameras are turned, seed
+    [(5, 5, 6.0, 1.0, 1), (4, 5, 6.0, 2.0, 0), (4, 5, 2.0, 1.0, 1), *slow((5, 8, 0.7, 2.0, 0), (6, 5, 2.0, 2.0, 1))],
+)
+def test_a_receiver_is_right_beside_a_rig_whose_few_units_take_any_size(
+    drive: tuple[int, int, float, float, int],
+) -> None:
+    """Cameras that hardly share a view, turned by a degree or two, on their first metres from a standstill."""
+    cameras, units, way_m, by_deg, seed = drive
+    simulated = make_simulated_drive(
+        units=units,
+        cameras=cameras,
+        points=600,
+        straight=True,
+        travelled_m=way_m * (np.arange(units) / (units - 1)) ** 2,
+        given=partial(turned_about_every_axis, by_deg=by_deg, seed=seed),
+        seed=seed,
+    )
+    known = {"gnss": received(simulated, 0.05 * way_m), "antenna_in_rig_m": ARM_M}
+    mapper = mapped(simulated, AbsolutePriors(**known))
+    result = refine(mapper, AbsolutePriors(**known))
+    assert result.placement is not None
+    assert not result.placement.reason
+    assert result.georeferenced
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert result.certainty is not None
+    assert 0.0 < abs(np.log(scale)) < 3.0 * result.certainty.sigma_scale
+    assert 0.7 < scale < 1.4
+
+
 @pytest.mark.parametrize("factor", [0.305, 1.6, *slow(2.4)])
 def test_positions_of_another_scale_than_the_rigs_give_the_scene_theirs_and_say_so(factor: float) -> None:
     """Baselines may be in feet, or a camera late by a frame; no receiver stretches a trajectory."""
