@@ -14,10 +14,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import pairwise
+from itertools import chain, islice, pairwise
 
 import cv2
 import numpy as np
@@ -27,6 +28,7 @@ from mrasfm_engine.features.static_outline import RESOLUTION, RIM_PX, StaticEdge
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_small
+from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import Bools, Bytes, Cancel, Floats, Floats32, Ints
 from schemas.findings import Finding, warning
@@ -129,16 +131,20 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
             return None
         return None if small is None else (small, _outlines(small))
 
-    with ThreadPoolExecutor(threads) as pool:
-        for index in np.unique(np.linspace(0, len(units) - 1, min(MAX_IMAGES, len(units))).round().astype(int)):
-            images = images_of[units[index]]
+    sampled = np.unique(np.linspace(0, len(units) - 1, min(MAX_IMAGES, len(units))).round().astype(int))
+    groups = [images_of[units[index]] for index in sampled.tolist()]
+    with (
+        closing(in_order(threads, look, chain.from_iterable(groups))) as found,
+        ThreadPoolExecutor(threads) as pool,
+    ):
+        for images in groups:
             # An image of another size than its camera's is refused by name when features are extracted.
             looks = [
                 (statistics[image.camera], *small)
-                for image, small in zip(images, pool.map(look, images), strict=True)
+                for image, small in zip(images, islice(found, len(images)), strict=True)
                 if small is not None
             ]
-            if _vehicle_moved([(of_camera, outlines) for of_camera, _, outlines in looks]):
+            if _vehicle_moved(pool, looks):
                 list(pool.map(lambda of_one: of_one[0].add(*of_one[1:]), looks))
         return list(pool.map(lambda camera: _judge(drive, camera, statistics[camera]), range(len(statistics))))
 
@@ -163,10 +169,10 @@ def large_share_finding(camera: str, mask: Bools | None) -> list[Finding]:
     ]
 
 
-def _vehicle_moved(looks: Sequence[tuple[_Statistics, Floats32]]) -> bool:
+def _vehicle_moved(pool: Executor, looks: Sequence[tuple[_Statistics, Bytes, Floats32]]) -> bool:
     """Return whether most cameras that compare show other outlines (h, w) than when images last counted."""
-    moved = [_moved(of_camera.last, outlines) for of_camera, outlines in looks if of_camera.last is not None]
-    return 2 * sum(moved) >= len(moved)
+    compared = [(of_camera.last, outlines) for of_camera, _, outlines in looks if of_camera.last is not None]
+    return 2 * sum(pool.map(lambda both: _moved(*both), compared)) >= len(compared)
 
 
 def _judge(drive: Drive, camera: int, statistics: _Statistics) -> OwnCar:

