@@ -79,6 +79,7 @@ class GroundTiles:
     def __init__(self, ground: GroundHeights) -> None:
         self._ground = ground
         self._tiles: dict[tuple[int, int], Floats] = {}
+        self._last: tuple[list[int], Floats] | None = None
 
     def around(self, centre_m: Floats, reach_m: float) -> tuple[Floats, Floats]:
         """Heights (rows, columns), y growing with the rows, that cover the square of `reach_m` around a place (2,).
@@ -89,8 +90,13 @@ class GroundTiles:
         low = np.floor((centre_m - reach_m) / side_m).astype(int)
         # One step more: interpolation asks for the corner after the place.
         high = np.floor((centre_m + reach_m + HEIGHT_STEP_M) / side_m).astype(int)
-        tiles = [[self._tile(i, j) for i in range(low[0], high[0] + 1)] for j in range(low[1], high[1] + 1)]
-        return np.block(tiles), low * side_m
+        corners = [*low.tolist(), *high.tolist()]
+        # The cameras of one rig stand close together.
+        last = self._last  # of whichever thread
+        if last is None or last[0] != corners:
+            tiles = [[self._tile(i, j) for i in range(low[0], high[0] + 1)] for j in range(low[1], high[1] + 1)]
+            self._last = last = corners, np.block(tiles)
+        return last[1], low * side_m
 
     def _tile(self, i: int, j: int) -> Floats:
         if (i, j) not in self._tiles:

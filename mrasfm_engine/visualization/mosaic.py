@@ -22,7 +22,7 @@ from mrasfm_engine.visualization.pixel_lattice import (
     LINEAR,
     SKIPPED,
     all_shown,
-    between_nodes,
+    along_row,
     meets_car,
     node_step,
     place_nodes,
@@ -238,13 +238,11 @@ def _paint_squares(
         is_given_linear = all_shown(given, i, j)
         for row in range(rows[i], rows[i + 1]):
             y = y_first - row * cell
+            row_u, row_v, row_z, step_u, step_v, step_z = along_row(nodes, rows, columns, i, j, row)
+            given_u, given_v, _, given_step_u, given_step_v, _ = along_row(given, rows, columns, i, j, row)
             for column in range(columns[j], columns[j + 1]):
-                x = x_first + column * cell
-                # Written out in both kernels: behind functions of their own, these branches take twice the time.
-                if square == LINEAR:
-                    u, v, z = between_nodes(nodes, rows, columns, i, j, row, column)
-                else:
-                    z = height_at(heights, x - first[0], y - first[1])
+                x, along = x_first + column * cell, column - columns[j]
+                z = row_z + along * step_z if square == LINEAR else height_at(heights, x - first[0], y - first[1])
                 dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
                 d2 = dx * dx + dy * dy + above * above
                 if d2 > VIEW_M * VIEW_M:
@@ -256,6 +254,7 @@ def _paint_squares(
                 if layer < 0:
                     continue
                 if square == LINEAR:
+                    u, v = row_u + along * step_u, row_v + along * step_v
                     if not shows(rgb, usable, has_mask, u, v):
                         continue
                     if at_car and hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above):
@@ -276,7 +275,7 @@ def _paint_squares(
                 owner[layer, row, column], score[layer, row, column] = camera, s
                 sample(rgb, u, v, gain, color[1, layer, row, column])
                 if is_given_linear:
-                    u, v, z = between_nodes(given, rows, columns, i, j, row, column)
+                    u, v = given_u + along * given_step_u, given_v + along * given_step_v
                     sample(rgb, u, v, gain, color[0, layer, row, column])
                 else:
                     m = cam_from_plan[0]

@@ -119,18 +119,24 @@ def all_shown(nodes: Any, i: int, j: int) -> bool:
 
 
 @uncounted(forceinline=True)
-def between_nodes(
-    nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int, column: int
-) -> tuple[float, float, float]:
-    """Pixel u, v and height z of a cell, bilinear between the corners of its square."""
-    a = (row - rows[i]) / (rows[i + 1] - rows[i])
-    b = (column - columns[j]) / (columns[j + 1] - columns[j])
-    w00, w01, w10, w11 = (1.0 - a) * (1.0 - b), (1.0 - a) * b, a * (1.0 - b), a * b
+def along_row(
+    nodes: Any, rows: Any, columns: Any, i: int, j: int, row: int
+) -> tuple[float, float, float, float, float, float]:
+    """Pixel u, v and height z of a row's first cell in a square, and what they grow by from one cell to the next.
+
+    They are bilinear between the corners of the square.
+    """
+    b = (row - rows[i]) / (rows[i + 1] - rows[i])
+    a, width = 1.0 - b, columns[j + 1] - columns[j]
     p, q, r, s = nodes[i, j], nodes[i, j + 1], nodes[i + 1, j], nodes[i + 1, j + 1]
+    u, v, z = a * p[0] + b * r[0], a * p[1] + b * r[1], a * p[2] + b * r[2]
     return (
-        w00 * p[0] + w01 * q[0] + w10 * r[0] + w11 * s[0],
-        w00 * p[1] + w01 * q[1] + w10 * r[1] + w11 * s[1],
-        w00 * p[2] + w01 * q[2] + w10 * r[2] + w11 * s[2],
+        u,
+        v,
+        z,
+        (a * q[0] + b * s[0] - u) / width,
+        (a * q[1] + b * s[1] - v) / width,
+        (a * q[2] + b * s[2] - z) / width,
     )
 
 

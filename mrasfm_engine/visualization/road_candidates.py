@@ -18,7 +18,7 @@ from mrasfm_engine.types import Bools, Bytes, Floats, Ints
 from mrasfm_engine.visualization.pixel_lattice import (
     LINEAR,
     SKIPPED,
-    between_nodes,
+    along_row,
     meets_car,
     node_step,
     place_nodes,
@@ -214,13 +214,10 @@ def _add_to_squares(
         at_car = meets_car(rig_from_plan, own_car, x_first, y_first, cell, rows, columns, nodes, i, j, centre)
         for row in range(rows[i], rows[i + 1]):
             y = y_first - row * cell
+            row_u, row_v, row_z, step_u, step_v, step_z = along_row(nodes, rows, columns, i, j, row)
             for column in range(columns[j], columns[j + 1]):
-                x = x_first + column * cell
-                # Written out in both kernels: behind functions of their own, these branches take twice the time.
-                if square == LINEAR:
-                    u, v, z = between_nodes(nodes, rows, columns, i, j, row, column)
-                else:
-                    z = height_at(heights, x - first[0], y - first[1])
+                x, along = x_first + column * cell, column - columns[j]
+                z = row_z + along * step_z if square == LINEAR else height_at(heights, x - first[0], y - first[1])
                 dx, dy, above = x - centre[0], y - centre[1], centre[2] - z
                 d2 = dx * dx + dy * dy + above * above
                 if d2 > VIEW_M * VIEW_M:
@@ -241,6 +238,7 @@ def _add_to_squares(
                 if s <= beaten:
                     continue
                 if square == LINEAR:
+                    u, v = row_u + along * step_u, row_v + along * step_v
                     if not shows(rgb, usable, has_mask, u, v):
                         continue
                     if at_car and hidden_by_car(rig_from_plan, own_car, x, y, z, dx, dy, above):

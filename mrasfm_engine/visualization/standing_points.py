@@ -22,7 +22,6 @@ TALL = 0.6  # of the camera's height: what reaches that is taken to go on upward
 STEP_M = 0.1  # of the raster
 SIDE = 2 * round(VIEW_M / STEP_M) + 1
 HALF_WIDTH_M = 0.15  # of the strip that a point hides, where it stands: about the distance of points on one thing
-MIN_POINTS = 1  # that hide a place: a single one may be wrong
 
 
 class StandingPoints:
@@ -46,7 +45,7 @@ class StandingPoints:
     def hidden_from(self, view: int, placed: PlacedView) -> Bools:
         """Raster (301, 301) of `STEP_M` around a view's camera, y growing with the rows: whether things hide the
         ground."""
-        count = np.zeros((SIDE, SIDE), np.uint8)
+        hidden = np.zeros((SIDE, SIDE), np.bool_)
         seen = self._seen_by[view]
         foot_m = self._points_m[seen, :2] - placed.centre_m[:2]
         near = np.hypot(*foot_m.T) < VIEW_M
@@ -56,8 +55,8 @@ class StandingPoints:
             stands = (above_m > STANDING_M) & (share < OVERHEAD)
             # By similar triangles, the ray over the point meets the ground that many times as far away.
             times = np.where(share < TALL, 1 / (1 - np.minimum(share, TALL)), np.inf)
-            _hide(foot_m[near][stands], times[stands], count)
-        return count >= MIN_POINTS
+            _hide(foot_m[near][stands], times[stands], hidden)
+        return hidden
 
     def _above_ground_m(self, points: Ints) -> Floats:
         """Heights (n,) of points above the ground, each computed once: tens of views see a point."""
@@ -69,10 +68,10 @@ class StandingPoints:
 
 
 @njit(cache=True, nogil=True)
-def _hide(foot: Any, times: Any, count: Any) -> None:
-    """Count the points that hide every place of the raster; each once."""
-    middle = count.shape[0] // 2
-    last = np.full(count.shape, -1, np.int32)
+def _hide(foot: Any, times: Any, hidden: Any) -> None:
+    """Mark every place of the raster that a point hides."""
+    rows, columns = hidden.shape
+    middle = rows // 2
     for p in range(len(foot)):
         distance = np.hypot(foot[p, 0], foot[p, 1])
         if distance < STEP_M:
@@ -83,10 +82,7 @@ def _hide(foot: Any, times: Any, count: Any) -> None:
         while r <= reach:
             half = int(HALF_WIDTH_M * r / distance / STEP_M + 0.5)
             i, j = round(middle + along_y * r / STEP_M), round(middle + along_x * r / STEP_M)
-            for a in range(max(i - half, 0), min(i + half + 1, count.shape[0])):
-                for b in range(max(j - half, 0), min(j + half + 1, count.shape[1])):
-                    if last[a, b] != p:
-                        last[a, b] = p
-                        if count[a, b] < 255:
-                            count[a, b] += 1
+            left, right = max(j - half, 0), min(j + half + 1, columns)
+            for a in range(max(i - half, 0), min(i + half + 1, rows)):
+                hidden[a, left:right] = True
             r += STEP_M

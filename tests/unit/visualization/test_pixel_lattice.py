@@ -14,7 +14,7 @@ from mrasfm_engine.visualization.pixel_lattice import (
     EXACT,
     LINEAR,
     SKIPPED,
-    between_nodes,
+    along_row,
     meets_car,
     node_step,
     place_nodes,
@@ -83,7 +83,8 @@ def test_interpolated_pixels_are_a_small_part_of_a_cell_off_and_nothing_visible_
 
 
 def _between(nodes: Floats, rows: Floats, columns: Floats, row: int, column: int, i: int, j: int) -> Floats:
-    return np.array(between_nodes(nodes, rows, columns, i, j, row, column)[:2])
+    u, v, _, u_step, v_step, _ = along_row(nodes, rows, columns, i, j, row)
+    return np.array([u, v]) + (column - columns[j]) * np.array([u_step, v_step])
 
 
 def test_a_square_with_a_corner_that_the_camera_does_not_show_is_projected_cell_by_cell() -> None:
