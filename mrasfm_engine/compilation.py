@@ -1,7 +1,7 @@
 """Compilation of the engine's inner loops for the machine at hand.
 
 numba compiles a function when it is first called and keeps the result (in `NUMBA_CACHE_DIR`, or beside the sources), so
-only the first run on a machine, and the first after an update, takes two to three minutes longer. That shall be seen,
+only the first run on a machine, and the first after an update, takes one to two minutes longer. That shall be seen,
 and not pass for slow mapping.
 """
 

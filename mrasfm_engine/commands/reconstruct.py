@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     console = Console(stderr=True)
     with (
         cancel_on_interrupt(console) as cancelled,
-        watched_compilation(lambda: console.print("compiling for this machine: two to three minutes, once")),
+        watched_compilation(lambda: console.print("compiling for this machine: one to two minutes, once")),
         stage_progress(console) as progress,
     ):
         report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled, is_new=True)

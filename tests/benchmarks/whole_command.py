@@ -47,9 +47,10 @@ def whole_command(data: Path, work: Path) -> Iterator[Figure]:
         real = next(real for real in DRIVES if real.name == name)
         drive, scene = imported(data, name, work, *real.options), work / f"{name} whole command"
         figure = partial(Figure, line="35")
-        started = time.perf_counter()
-        mrasfm("reconstruct", drive, "--out", scene, "--no-gnss")
-        ours_s = time.perf_counter() - started
+        # The first run after an update compiles kernels, as the peer's were before it was installed.
+        first_s = _timed_s("reconstruct", drive, "--out", work / f"{name} first run", "--no-gnss")
+        yield figure(what=f"{name}: ours, the run before, which compiles what is not compiled", value=first_s, unit="s")
+        ours_s = _timed_s("reconstruct", drive, "--out", scene, "--no-gnss")
         similarity_m = evaluate(scene, drive)["similarity"]["rmse_m"]
         yield figure(what=f"{name}: ours, from files to scene with pictures", value=ours_s, unit="s")
         yield figure(what=f"{name}: ours, similarity RMSE", value=similarity_m, unit="m")
@@ -66,6 +67,13 @@ def whole_command(data: Path, work: Path) -> Iterator[Figure]:
             yield figure(what=f"{peer_title}, similarity RMSE", value=peer.similarity_rmse_m, unit="m")
             ratio = peer.seconds / ours_s
             yield figure(what=f"{name}: times as fast as COLMAP {title}", value=ratio, above=bound, most=100.0)
+
+
+def _timed_s(*arguments: object) -> float:
+    """Seconds of a command."""
+    started = time.perf_counter()
+    mrasfm(*arguments)
+    return time.perf_counter() - started
 
 
 def _colmap(drive: Path, scene: Path, database: Path, *, max_side_px: int, keypoints: int | None) -> Peer:

@@ -26,7 +26,7 @@ A few commands have further codes; they are listed with the command. An interrup
 finished stage when the same command runs again.
 
 The first run on a machine, and the first run after an update, compiles the inner loops for the machine and takes
-two to three minutes longer. If standard error is no terminal, stages print a plain line when they begin, when they end,
+one to two minutes longer. If standard error is no terminal, stages print a plain line when they begin, when they end,
 and every 30 s in between.
 """
 
