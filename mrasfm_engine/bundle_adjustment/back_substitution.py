@@ -101,13 +101,16 @@ def _substitute(
 @njit(cache=True, nogil=True)
 def add_scores(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
-    loss: Loss, columns: Any, v_inverse: Any, image: Any, most: int, lo: int, hi: int, out: Any,
+    loss: Loss, columns: Any, v_inverse: Any, group: Any, most: int, lo: int, hi: int, out: Any, by_points: Any,
 ) -> None:  # fmt: skip
-    """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their images' scores."""
+    """Add r' (J_poses x + J_point y) of the observations of points lo..hi, y = -V^-1 W' x, to their groups' scores.
+
+    And to those of groups (g, k) of points, which are dealt out in turn.
+    """
     count = columns.shape[1]
     along, normal = np.empty((2, count)), np.empty((most, 3))  # of an observation; J_point' r of each
     _add_scores(
-        views, bands, motion, points, observed, free_slots, loss, columns, v_inverse, image, lo, hi, out,
+        views, bands, motion, points, observed, free_slots, loss, columns, v_inverse, group, lo, hi, out, by_points,
         workspace(6 + len(free_slots.inner)), along, normal, np.empty((3, count)), np.empty((3, count)),
     )  # fmt: skip
 
@@ -115,7 +118,7 @@ def add_scores(
 @uncounted()
 def _add_scores(
     views: Views, bands: Bands | None, motion: Motion | None, points: Any, observed: Observed, free_slots: Slots,
-    loss: Loss, columns: Any, v_inverse: Any, image: Any, lo: int, hi: int, out: Any,
+    loss: Loss, columns: Any, v_inverse: Any, group: Any, lo: int, hi: int, out: Any, by_points: Any,
     memory: Any, along: Any, normal: Any, e: Any, shift: Any,
 ) -> None:  # fmt: skip
     unit_slot, camera_slot, num_units, inner_places = free_slots
@@ -124,7 +127,7 @@ def _add_scores(
     unit_r, unit_t, cam_r, cam_t, kind, params = views
     obs_unit, obs_camera, _, obs_xy, first, fixed = observed
     for p in range(lo, hi):
-        begin, end = first[p], first[p + 1]
+        begin, end, of_point = first[p], first[p + 1], p % len(by_points)
         e[:] = 0.0
         for n in range(begin, end):
             u, c, band = obs_unit[n], obs_camera[n], row_band(bands, n)
@@ -143,7 +146,9 @@ def _add_scores(
                     _add_moved_points(d, weight, columns, 6 * slot, shift)
             _residuals_along(jx, jc, shift, columns, -1 if sc < 0 else 6 * num_units + dof * sc, along)
             for k in range(count):
-                out[image[n], k] += res[0] * along[0, k] + res[1] * along[1, k]
+                score = res[0] * along[0, k] + res[1] * along[1, k]
+                out[group[n], k] += score
+                by_points[of_point, k] += score
             for j in range(3):
                 normal[n - begin, j] = jx[0, j] * res[0] + jx[1, j] * res[1]
                 for k in range(count):
@@ -155,7 +160,9 @@ def _add_scores(
         for n in range(begin, end):
             q = normal[n - begin]
             for k in range(count):
-                out[image[n], k] -= q[0] * shift[0, k] + q[1] * shift[1, k] + q[2] * shift[2, k]
+                score = q[0] * shift[0, k] + q[1] * shift[1, k] + q[2] * shift[2, k]
+                out[group[n], k] -= score
+                by_points[of_point, k] -= score
 
 
 @uncounted(forceinline=True)

@@ -73,8 +73,9 @@ def find_shared_errors(
     if observes.sum() < MIN_UNITS or not columns.any():
         return None
     number = np.cumsum(observes) - 1  # among the units that observe anything
-    of_units = problem.scores(state, system, columns, number[problem.observations.unit])
-    of_points = problem.scores(state, system, columns, problem.observations.point % POINT_GROUPS)
+    of_units, of_points = problem.scores(
+        state, system, columns, number[problem.observations.unit], min(POINT_GROUPS, problem.observations.num_points)
+    )
     covariance = of_points.T @ of_points + _of_terms(problem, state, columns)
     known = np.diagonal(covariance) > 0.0
     covariance[np.ix_(known, known)] = _widened(covariance[np.ix_(known, known)], of_units[:, known])

@@ -275,8 +275,12 @@ class Problem:
         result = self.retract(state, step, self.points_after(state, system, step))
         return result, *self.refine_points(result, state, costs)
 
-    def scores(self, state: State, system: ReducedCameraSystem, columns: Floats, group: Ints) -> Floats:
+    def scores(
+        self, state: State, system: ReducedCameraSystem, columns: Floats, group: Ints, point_groups: int
+    ) -> tuple[Floats, Floats]:
         """Sums (groups, k) of J' w r over the observations of each group, along k steps of everything but points.
+
+        And over those of points (point_groups, k), dealt out to so many groups in turn.
 
         Parameters
         ----------
@@ -285,19 +289,19 @@ class Problem:
         group
             Of each observation.
         """
-        o = self.observations
-        parts = np.zeros((self.options.threads, int(group.max(initial=-1)) + 1, columns.shape[1]))
+        o, count = self.observations, columns.shape[1]
+        parts = np.zeros((self.options.threads, int(group.max(initial=-1)) + 1, count))
+        point_parts = np.zeros((self.options.threads, point_groups, count))
         views, motion, observed, free_slots = self._views(state), self._motion, self._observed, self._slots
         most, along = int(np.diff(o.first_of_point).max(initial=0)), np.ascontiguousarray(columns)
         in_parts(
             even_bounds(o.num_points, self.options.threads),
             lambda lo, hi, part: add_scores(
                 *views, motion, state.points_m, observed, free_slots, self.options.loss,
-                along, system.v_inverse, group, most, lo, hi, parts[part],
+                along, system.v_inverse, group, most, lo, hi, parts[part], point_parts[part],
             ),
         )  # fmt: skip
-        result: Floats = parts.sum(0)
-        return result
+        return parts.sum(0), point_parts.sum(0)
 
 
 _THREADS = ThreadpoolController()

@@ -180,8 +180,11 @@ def test_scores_of_all_images_cancel_with_those_of_the_priors() -> None:
     system = problem.normal_equations(solution, 0.0)
     rng = np.random.default_rng(0)
     steps = rng.normal(size=(problem.layout.size, 3))
-    scores = problem.scores(solution, system, steps, problem.observations.unit)
+    scores, of_points = problem.scores(solution, system, steps, problem.observations.unit, 7)
     assert scores.shape == (UNITS, 3)
+    np.testing.assert_allclose(of_points.sum(0), scores.sum(0), atol=1e-9 * np.abs(scores).max())
+    one_by_one, _ = problem.scores(solution, system, steps, problem.observations.point % 7, 7)
+    np.testing.assert_allclose(of_points, one_by_one, atol=1e-9 * np.abs(one_by_one).max())
     # The system's gradient has that of the terms, and of points that could still move: they have moved.
     from_terms = system.gradient - replace(problem, terms=[]).normal_equations(solution, 0.0).gradient
     np.testing.assert_allclose(scores.sum(0), (system.gradient - from_terms) @ steps, atol=1e-6 * np.abs(scores).max())
