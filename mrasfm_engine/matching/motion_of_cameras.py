@@ -52,6 +52,7 @@ from schemas.findings import Finding, warning
 MAX_MOTIONS = 30  # more say little: lens models err alike in all of them
 MAX_MATCHES = 40  # of two images
 MIN_PARALLAX_RAD = np.radians(0.5)  # median: by less than some pixels images do not tell which way their camera went
+TOLD = 0.5  # of the standard deviation of a turn between two cameras: what is left where their images tell it
 USUAL_SPEED_MPS = 8.0  # 30 km/h: of walking pace and of a motorway, neither is a factor of six away
 SIGMA_SPEED = np.log(6.0) / 2.0  # so that both are two standard deviations away
 SIGMA_SPEED_CHANGES = np.log(2.0)  # of single motions against the others
@@ -131,7 +132,9 @@ def rig_by_motion(
     rig
         As simultaneous images correct it.
     """
-    found, elapsed_s = _motions(drive, pairs if calibration.refine_calibration else (), rays_of, match_config)
+    groups = _groups_that_share_views(rig)
+    compared = calibration.refine_calibration and len(set(groups)) > 1
+    found, elapsed_s = _motions(drive, pairs if compared else (), groups, rays_of, match_config)
     return estimate_rig_by_motion(
         rig,
         found,
@@ -360,19 +363,40 @@ def _start(rig: UncertainRig, one: MotionMatches, max_error: float) -> tuple[Flo
     return rig_from_cam @ rotation.T @ rig_from_cam.T, -rig_from_cam @ rotation.T @ translation
 
 
+def _groups_that_share_views(rig: UncertainRig) -> list[int]:
+    """Number of each camera's group, in which simultaneous images tell the rotations against one another.
+
+    They do where they leave less than half of what is uncertain of the two cameras: matches of one instant tell that
+    better than motions.
+    """
+    turns = rig.covariance.reshape(len(rig.rig_from_cam), 6, -1, 6)[:, :3, :, :3].swapaxes(1, 2)
+    group = list(range(len(turns)))
+    for a, b in combinations(group.copy(), 2):
+        own = turns[a, a] + turns[b, b]
+        between, alone = (np.linalg.eigvalsh(each)[-1] for each in (own - turns[a, b] - turns[b, a], own))
+        if between < TOLD**2 * alone:
+            group = [group[a] if of == group[b] else of for of in group]
+    return group
+
+
 def _motions(
     drive: Drive,
     pairs: Sequence[PairMatches],
+    groups: Sequence[int],
     rays_of: Callable[[PairMatches], tuple[Floats, Floats]],
     config: MatchConfig,
 ) -> tuple[list[MotionMatches], Floats]:
-    """Matches of pairs of units that two cameras or more match, evenly over the drive, and the times (m,) between."""
+    """Matches of pairs of units that cameras of two groups match, evenly over the drive, and the times (m,) between."""
     between: dict[tuple[int, int], list[PairMatches]] = {}
     for pair in pairs:
         u, v = sorted(drive.images[image].unit for image in (pair.image_a, pair.image_b))
         if u < v and np.count_nonzero(pair.inliers) >= config.min_matches:
             between.setdefault((u, v), []).append(pair)
-    several = sorted(units for units, own in between.items() if len(_cameras_by_themselves(drive, own)) > 1)
+    several = sorted(
+        units
+        for units, own in between.items()
+        if len({groups[camera] for camera in _cameras_by_themselves(drive, own)}) > 1
+    )
     result, elapsed_s = list[MotionMatches](), list[float]()
     for row in np.unique(np.linspace(0, len(several) - 1, min(len(several), MAX_MOTIONS)).astype(np.int64)).tolist():
         u, v = several[row]

@@ -16,8 +16,9 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
 
 ROWS = 256  # of a product that exist at one time
-# Products of bytes are so fast that it counts where they are kept: written once and read twice, in a quarter of a core's
-# 2 MB they take 13 % to 30 % less than by ROWS, with 1500 to 4096 descriptors. Of fewer rows than these, calls cost more.
+# Products of bytes are so fast that it counts where they are kept: written once and read twice, in a quarter of a
+# core's 2 MB they take 13 % to 30 % less time than by ROWS, with 1500 to 4096 descriptors. Calls with fewer rows than
+# these cost more.
 CACHED_PRODUCTS, FEWEST_ROWS = 1 << 17, 32
 LANES = 128  # columns that are taken at once, in vector registers; a column belongs to lane column % LANES
 SCALAR_LANES = 8  # from here on a loop of one by one is as fast
