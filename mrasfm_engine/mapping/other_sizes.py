@@ -119,16 +119,20 @@ def _adjusted_cost(
     options: SolverOptions,
 ) -> float:
     """Cost of the scene, adjusted with what fits it until that changes no more."""
-    cost = np.inf
+    least, best = np.inf, _parts_of(mapper)
     for _ in range(MOST_ROUNDS):
         known = terms()
         adjust(known)
-        before, cost = cost, min(cost, _cost(mapper, known, options))
-        if before - cost < SMALL:
+        cost = _cost(mapper, known, options)
+        if cost >= least:
+            break
+        gain, least, best = least - cost, cost, copy.deepcopy(_parts_of(mapper))
+        if gain < SMALL:
             break
         mapper.complete()
         mapper.drop(dropped)
-    return cost
+    _restore(mapper, best)
+    return least
 
 
 def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> float:

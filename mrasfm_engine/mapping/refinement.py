@@ -7,9 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.marginal_covariances import (
-    covariances,
-)
+from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import ReconstructionError

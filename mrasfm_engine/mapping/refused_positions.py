@@ -22,7 +22,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
 )
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
-from mrasfm_engine.mapping.calibration import calibration_prior, sigma_scale_of_images
+from mrasfm_engine.mapping.calibration import calibration_prior, has_few_units, sigma_scale_of_images
 from mrasfm_engine.mapping.given_scale import scale_of_given_rotations
 from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
 from mrasfm_engine.mapping.mapper import Mapper
@@ -45,12 +45,13 @@ def compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel |
     if result.placement is None or not result.placement.is_of_another_scale:
         return
     result.sigma_px = observation_sigma_px(mapper)
+    weighed = replace(scene, sigma_factor=known.sigma_factor)
     scenes = scenes_of_sizes(
         mapper,
         (1.0, result.absolute.factor_by_positions(mapper)),
-        lambda terms: scene.adjust(terms, cancel),
-        scene.terms,
-        solver_options(mapper, replace(result, sigma_factor=known.sigma_factor)),
+        lambda terms: weighed.adjust(terms, cancel),
+        weighed.terms,
+        weighed.options,
     )
     scenes.take_best(mapper)
     scene.place(scene.certainty() or known, sigma_of_sizes=scenes.sigma_of_scale(size_m(mapper)))
@@ -58,19 +59,24 @@ def compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel |
 
 @dataclass(frozen=True, kw_only=True)
 class _WithoutPositions:
-    """The scene under its priors but for the positions that were refused."""
+    """The scene under its priors but for the positions that were refused.
+
+    `sigma_factor` is that of errors that observations share, once they are known.
+    """
 
     mapper: Mapper
     result: Refinement
     free_units: Bools
+    sigma_factor: float = 1.0
 
     @property
     def _cameras(self) -> Bools:
         return np.ones(len(self.mapper.camera_kind), dtype=np.bool_)
 
     @property
-    def _options(self) -> SolverOptions:
-        return solver_options(self.mapper, self.result)
+    def options(self) -> SolverOptions:
+        """Settings of its adjustments."""
+        return solver_options(self.mapper, replace(self.result, sigma_factor=self.sigma_factor))
 
     def terms(self) -> list[Term]:
         """Priors by the scene as it is."""
@@ -83,18 +89,20 @@ class _WithoutPositions:
             self.free_units,
             free_cameras=self._cameras & self.mapper.config.bundle_adjustment.refine_calibration,
             terms=terms,
-            options=self._options,
+            options=self.options,
             cancel=cancel,
         )
 
     def certainty(self) -> Covariances | None:
         """Covariances with all cameras free under their prior; None where there is too much for an inverse."""
         problem, _ = self.mapper.problem(
-            self.free_units, free_cameras=self._cameras, terms=self.terms(), options=self._options
+            self.free_units, free_cameras=self._cameras, terms=self.terms(), options=self.options
         )
         if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
             return None
-        return covariances(problem, problem.state)
+        # Where cameras are held, what a wrong one leaves in each of few units passes for an error that they share.
+        are_held = not self.mapper.config.bundle_adjustment.refine_calibration
+        return covariances(problem, problem.state, shared_errors=not (are_held and has_few_units(self.mapper)))
 
     def place(self, known: Covariances, *, sigma_of_sizes: float = 0.0) -> None:
         """Place the scene by positions if they fit it: its scale is as certain as its curvature and other sizes say.
@@ -102,7 +110,7 @@ class _WithoutPositions:
         Errors of lens models, which no residual shows, come on top.
         """
         lens = scale_of_given_rotations(
-            self.mapper, free_units=self.free_units, free_times=None, terms=self.terms(), options=self._options
+            self.mapper, free_units=self.free_units, free_times=None, terms=self.terms(), options=self.options
         )
         of_images = max(sigma_scale_of_images(self.mapper, known), sigma_of_sizes)
         sigma_scale = float(np.hypot(of_images, 0.0 if lens is None else lens.sigma_scale))

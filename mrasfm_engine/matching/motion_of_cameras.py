@@ -38,6 +38,7 @@ from mrasfm_engine.matching.sampson import epipolar_derivatives
 from mrasfm_engine.matching.simultaneous import (
     INDEPENDENT_MATCHES,
     MIN_SIGMA_PX,
+    MIN_UNITS,
     SIGNIFICANT_SIGMAS,
     WEAK_PRIOR,
     largest_turn_rad,
@@ -70,6 +71,11 @@ class MotionMatches:
     camera_b: int
     rays_a: Floats
     rays_b: Floats
+
+    @property
+    def cameras(self) -> tuple[int, int]:
+        """Both cameras, whichever came first."""
+        return min(self.camera_a, self.camera_b), max(self.camera_a, self.camera_b)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,7 +175,8 @@ def estimate_rig_by_motion(
     )
     # What the prior lets expect is left to the adjustment, which weighs it against everything else.
     expected = np.hypot(problem.sigma_rad[:, None], problem.sigma_rad)
-    if (before <= expected).all():
+    # A lorry that fills one camera's images moves as well, but not between many pairs of units.
+    if len(problem.alone) < MIN_UNITS or (before <= expected).all():
         return result
     for begin in problem.starts():
         corrected = problem.begun_with(problem.demanded(problem.most_likely(begin)))
@@ -243,7 +250,7 @@ class _MotionProblem:
         """Share of an independent match that each of two cameras counts as, over all motions."""
         counts: Counter[tuple[int, int]] = Counter()
         for one in self.found:
-            counts[one.camera_a, one.camera_b] += len(one.rays_a)
+            counts[one.cameras] += len(one.rays_a)
         return {cameras: min(1.0, INDEPENDENT_MATCHES / count) for cameras, count in counts.items()}
 
     def turned(self, x: Floats) -> Floats:
@@ -345,7 +352,7 @@ class _MotionProblem:
             rows=np.concatenate([np.arange(self.turns + 1), np.arange(first, first + UNKNOWNS)]),
             error=error,
             jacobian=derivatives @ moved,
-            weight=self.weights[a, b],
+            weight=self.weights[one.cameras],
         )
 
     def pixel_rad(self, one: MotionMatches) -> float:

@@ -103,6 +103,17 @@ def test_a_camera_that_moves_as_no_calibration_lets_it_is_not_turned() -> None:
     assert found.apart_before_rad[FRONT, BACK_LEFT] > 0.5
 
 
+def test_few_motions_turn_no_camera() -> None:
+    """A lorry that fills one camera's images moves as well."""
+    simulated = turned([0.0, 8.0, 0.0])
+    unit_of = [image.unit for image in simulated.drive.images]
+    pairs = [pair for pair in true_matches(simulated) if {unit_of[pair.image_a], unit_of[pair.image_b]} <= {3, 4}]
+    found = by_motion(simulated, pairs)
+    assert found.motions == 1
+    assert found.apart_before_rad[FRONT, BACK_LEFT] > np.radians(5.0)
+    assert not found.is_corrected
+
+
 def test_a_turn_that_the_declared_sigma_lets_expect_is_left_to_the_adjustment() -> None:
     simulated = turned([0.0, 5.0, 0.0])
     assert by_motion(simulated).is_corrected
