@@ -72,11 +72,6 @@ class MotionMatches:
     rays_a: Floats
     rays_b: Floats
 
-    @property
-    def cameras(self) -> tuple[int, int]:
-        """Both cameras, whichever came first."""
-        return min(self.camera_a, self.camera_b), max(self.camera_a, self.camera_b)
-
 
 @dataclass(frozen=True, kw_only=True)
 class MotionEstimate:
@@ -247,10 +242,13 @@ class _MotionProblem:
 
     @cached_property
     def weights(self) -> Mapping[tuple[int, int], float]:
-        """Share of an independent match that each of two cameras counts as, over all motions."""
+        """Share of an independent match that each of two cameras counts as, over all motions.
+
+        Of two cameras, matches from the one to the other are of other parts of their images than those back.
+        """
         counts: Counter[tuple[int, int]] = Counter()
         for one in self.found:
-            counts[one.cameras] += len(one.rays_a)
+            counts[one.camera_a, one.camera_b] += len(one.rays_a)
         return {cameras: min(1.0, INDEPENDENT_MATCHES / count) for cameras, count in counts.items()}
 
     def turned(self, x: Floats) -> Floats:
@@ -352,7 +350,7 @@ class _MotionProblem:
             rows=np.concatenate([np.arange(self.turns + 1), np.arange(first, first + UNKNOWNS)]),
             error=error,
             jacobian=derivatives @ moved,
-            weight=self.weights[one.cameras],
+            weight=self.weights[a, b],
         )
 
     def pixel_rad(self, one: MotionMatches) -> float:
