@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NoReturn
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export import comparisons, readers
+from mrasfm_engine.export import colmap_io, comparisons, readers
 from mrasfm_engine.export.colmap import text_model_fits
 from mrasfm_engine.export.comparisons import Rows
 from mrasfm_engine.export.file_contents import sha256
@@ -45,7 +45,7 @@ def binary_model_checks(scene: Scene) -> list[Check]:
     """Checks of the binary model; the text model is made of it."""
     return [
         Check("model/images.bin", readers.images_binary, partial(comparisons.images, scene)),
-        Check("model", readers.model_binary, partial(comparisons.model, scene)),
+        Check("model", colmap_io.read_binary, partial(comparisons.model, scene)),
     ]
 
 
@@ -54,7 +54,7 @@ def common_checks(scene: Scene) -> list[Check]:
     text = [
         Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
         Check("model/text/points3D.txt", readers.points_text, partial(comparisons.points_text, scene)),
-        Check("model/text", readers.model_text, partial(comparisons.model, scene)),
+        Check("model/text", colmap_io.read_text, partial(comparisons.model, scene)),
     ]
     return [
         *(text if text_model_fits(scene) else []),

@@ -1,4 +1,4 @@
-"""The scene as a COLMAP model with rigs and frames, binary and text.
+"""The scene as a COLMAP model with rigs and frames.
 
 The binary files are packed here: point by point through pycolmap's Python objects takes many times as long. Ids:
 image = index + 1, frame = unit + 1, camera = index + 1, point = index + 1; keypoints keep their indices. The rig frame
@@ -19,7 +19,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.export.file_contents import sha256, write_content
+from mrasfm_engine.export.colmap_io import BINARY_FILES
+from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import NearestModel, nearest_model
 from mrasfm_engine.scene.scene import Scene
@@ -29,8 +30,6 @@ from schemas.findings import Finding, warning
 RIG_ID = 1
 REFERENCE_SENSOR_ID = 1
 SENSOR_CAMERA, SENSOR_IMU = 0, 1
-BINARY_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
-TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
 
 
 def write_model(scene: Scene, folder: Path) -> dict[str, str]:
@@ -48,12 +47,6 @@ def binary_file(scene: Scene, name: str) -> bytes:
         "points3D.bin": _points,
     }
     return writers[name](scene)
-
-
-def write_text_model(binary_folder: Path, folder: Path) -> dict[str, str]:
-    """Write the text model of a binary one into an existing folder; the SHA-256 of its files by name."""
-    pycolmap.Reconstruction(str(binary_folder)).write_text(str(folder))
-    return {name: sha256(folder / name) for name in TEXT_FILES}
 
 
 def text_model_fits(scene: Scene) -> bool:

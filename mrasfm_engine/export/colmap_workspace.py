@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from mrasfm_engine.export import colmap, comparisons, readers
+from mrasfm_engine.export import colmap, colmap_io, comparisons, readers
 from mrasfm_engine.export.check import Check
 from mrasfm_engine.export.contract import ExportWork, Written
 from mrasfm_engine.export.undistorted import undistorted, write_images
@@ -25,6 +25,6 @@ def write_colmap(work: ExportWork) -> Written:
     checks = [
         Check(f"{MODEL}/images.bin", readers.images_binary, partial(comparisons.images, made.scene)),
         Check(f"{MODEL}/points3D.bin", readers.points_binary, partial(comparisons.points_binary, made.scene)),
-        Check(MODEL, readers.model_binary, partial(comparisons.model, made.scene)),
+        Check(MODEL, colmap_io.read_binary, partial(comparisons.model, made.scene)),
     ]
     return Written(checks=[*checks, *write_images(work, made)], notes=made.notes(), digests=digests)

@@ -8,12 +8,12 @@ from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from mrasfm_engine.export.colmap import RIG_ID, colmap_models, frame_of_image
+from mrasfm_engine.export.colmap_io import ModelRead
 from mrasfm_engine.export.readers import ModelImage, ModelPoints, transforms
 from mrasfm_engine.export.road import DECIMALS
 from mrasfm_engine.scene.scene import Scene
@@ -90,46 +90,44 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
     yield Row("what it lacks of the registered images", [scene.drive.images[i].file for i in missing], [])
 
 
-def model(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
+def model(scene: Scene, found: ModelRead) -> Rows:
     """The poses that rigs and frames compose to, cameras, and points, as COLMAP has read them."""
     yield from _rigs_and_cameras(scene, found)
     registered = np.flatnonzero(scene.image_registered)
+    posed = [number for number, image in found.images.items() if image.cam_from_world is not None]
     yield Row("images: the registered ones", sorted(found.images), (registered + 1).tolist())
-    yield Row("images: those with a pose", sorted(found.reg_image_ids()), (registered + 1).tolist())
+    yield Row("images: those with a pose", sorted(posed), (registered + 1).tolist())
     counts, centres = np.bincount(scene.observation_image, minlength=len(scene.drive.images)), []
     for i, pose in zip(registered.tolist(), np.linalg.inv(_registered_poses(scene)), strict=True):
         image, source = found.images[i + 1], scene.drive.images[i]
-        described = (image.name, image.camera_id, image.frame_id, image.num_points2D(), image.num_points3D)
+        described = (image.name, image.camera_id, image.frame_id, image.keypoints, image.observations)
         expected = (source.file, source.camera + 1, frame_of_image(scene, i), len(scene.features[i].xy_px), counts[i])
         yield Row("images: name, camera, frame, keypoints, observations", described, expected)
-        composed = image.cam_from_world().matrix()
+        composed = np.asarray(image.cam_from_world)
         yield Row(f"images: the composed pose of {source.file}", composed, pose[:3], POSE_TOLERANCE)
         centres.append(-composed[:, :3].T @ composed[:, 3])
     yield from _baselines(scene, np.reshape(centres, (-1, 3)))
-    yield Row("points3D: their number", found.num_points3D(), len(scene.points_m))
-    yield Row("points3D: observations", found.compute_num_observations(), len(scene.observation_point))
-    yield Row("the model's consistency, as COLMAP finds it,", found.is_valid(), True)
-    ids = np.array(list(found.points3D), dtype=np.int64)
-    xyz = np.reshape([point.xyz for point in found.points3D.values()], (-1, 3))
-    yield Row("points3D: a point", xyz[np.argsort(ids)], scene.points_m, POSE_TOLERANCE)
+    yield Row("points3D: their number", len(found.points), len(scene.points_m))
+    yield Row("points3D: observations", found.observations, len(scene.observation_point))
+    yield Row("the model's consistency, as COLMAP finds it,", found.is_valid, True)
+    yield Row("points3D: a point", found.points, scene.points_m, POSE_TOLERANCE)
 
 
-def _rigs_and_cameras(scene: Scene, found: pycolmap.Reconstruction) -> Rows:
+def _rigs_and_cameras(scene: Scene, found: ModelRead) -> Rows:
     vehicles, sizes = np.unique(scene.rig_of_camera, return_counts=True)
     yield Row("rigs: the vehicles", sorted(found.rigs), (vehicles + RIG_ID).tolist())
     for vehicle, size in zip(vehicles.tolist(), sizes.tolist(), strict=True):
         rig = found.rigs[vehicle + RIG_ID]
-        sensors = (rig.num_sensors(), rig.ref_sensor_id.type)
-        yield Row("rigs: cameras and the vehicle's reference", sensors, (size + 1, pycolmap.SensorType.IMU))
+        sensors = (rig.sensors, rig.reference_is_imu)
+        yield Row("rigs: cameras and the vehicle's reference", sensors, (size + 1, True))
     models = colmap_models(scene)
     for k, (given, refined, model) in enumerate(zip(scene.drive.cameras, scene.calibration, models, strict=True)):
         camera, rig = found.cameras[k + 1], found.rigs[int(scene.rig_of_camera[k]) + RIG_ID]
-        known = (camera.model.name, camera.width, camera.height)
-        yield Row(f"cameras: {given.name}", known, (model.model, given.width, given.height))
+        known = (camera.model, camera.size_px)
+        yield Row(f"cameras: {given.name}", known, (model.model, (given.width, given.height)))
         yield Row(f"cameras: {given.name}'s params", camera.params, model.params, ROUNDING)
-        sensor_from_rig = rig.sensor_from_rig(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, k + 1)).matrix()
         expected = np.linalg.inv(refined.rig_from_cam)[:3]
-        yield Row(f"rigs: {given.name}'s pose", sensor_from_rig, expected, POSE_TOLERANCE)
+        yield Row(f"rigs: {given.name}'s pose", rig.cam_from_rig[k + 1], expected, POSE_TOLERANCE)
 
 
 def _baselines(scene: Scene, centres: Floats) -> Rows:

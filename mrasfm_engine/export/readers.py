@@ -1,8 +1,8 @@
 """Readers of a result's files, for the check before it is put in place.
 
 They share no code with the writers: rotations are composed with scipy, the database is read with SQLite, COLMAP reads
-its model. What COLMAP overlooks (the poses that the image files hold one by one, and the points that they name) is
-parsed here.
+its model (`colmap_io`). What COLMAP overlooks is parsed here: the poses that the image files hold one by one, and the
+points that they name.
 """
 
 from __future__ import annotations
@@ -18,11 +18,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, NoReturn
 
 import numpy as np
-import pycolmap
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from mrasfm_engine.export.colmap import BINARY_FILES, TEXT_FILES
 from mrasfm_engine.io.read_model import read_vertices
 from mrasfm_engine.types import Floats, Ints
 from schemas import DriveManifest
@@ -101,29 +99,6 @@ def database(path: Path) -> Callable[[str], Iterator[Any]]:
 def _selected(path: Path, sql: str) -> Iterator[Any]:
     with closing(sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True)) as db:
         yield from db.execute(sql)
-
-
-def model_binary(folder: Path) -> pycolmap.Reconstruction:
-    """A binary model as COLMAP reads it."""
-    _require_files(folder, BINARY_FILES)
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.read_binary(str(folder))
-    return reconstruction
-
-
-def model_text(folder: Path) -> pycolmap.Reconstruction:
-    """A text model as COLMAP reads it."""
-    _require_files(folder, TEXT_FILES)
-    reconstruction = pycolmap.Reconstruction()
-    reconstruction.read_text(str(folder))
-    return reconstruction
-
-
-def _require_files(folder: Path, names: tuple[str, ...]) -> None:
-    # Without its file of rigs, COLMAP makes some up.
-    for name in names:
-        if not (folder / name).stat().st_size:
-            raise ValueError(f"{name} is empty")
 
 
 def images_binary(path: Path) -> Iterator[ModelImage]:

@@ -25,6 +25,7 @@ from mrasfm_engine.errors import CancelledError, MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
+    colmap_io,
     comparisons,
     coordinate_frame,
     feature_database,
@@ -236,7 +237,7 @@ def write_common(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any
     read_back.check(binary_model_checks(scene))
     if colmap.text_model_fits(scene):
         (model / "text").mkdir()
-        text = colmap.write_text_model(model, model / "text")
+        text = colmap_io.write_text(model, model / "text")
         read_back.expect({f"model/text/{name}": digest for name, digest in text.items()})
     else:
         figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")

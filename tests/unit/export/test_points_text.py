@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mrasfm_engine.export import colmap, comparisons, readers
+from mrasfm_engine.export import colmap, colmap_io, comparisons, readers
 from mrasfm_engine.scene.scene import Scene
 from tests.helpers.export_example import make_scene
 
@@ -22,7 +22,7 @@ def lines(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("model")
     colmap.write_model(scene, folder)
     (folder / "text").mkdir()
-    colmap.write_text_model(folder, folder / "text")
+    colmap_io.write_text(folder, folder / "text")
     return (folder / "text" / "points3D.txt").read_text(encoding="utf-8").splitlines(keepends=True)
 
 
