@@ -50,10 +50,14 @@ def heading_change_deg(mapper: Mapper) -> float:
 
 @dataclass(frozen=True)
 class CalibrationDecision:
-    """Decision whether `rig_from_cam` may vary, with its reason."""
+    """Decision whether `rig_from_cam` may vary, with its reason.
+
+    It is open where cameras are held because units are few: another size of the scene may contradict that.
+    """
 
     free: bool
     reason: str
+    is_open: bool = False
 
 
 def assess_calibration(
@@ -87,7 +91,9 @@ def assess_calibration(
             options=options,
         )
         if not np.isfinite(covariances(problem, problem.state, shared_errors=False).sigma_scale):
-            return CalibrationDecision(False, "held as given: too few units to tell what freeing it would do")
+            return CalibrationDecision(
+                False, "held as given: too few units to tell what freeing it would do", is_open=True
+            )
     return CalibrationDecision(
         True, "GNSS makes it observable" if georeferenced else "varies as far as the drive observes it"
     )

@@ -1,12 +1,17 @@
-"""Other sizes of a scene that images like as well as the one that was found.
+"""Other sizes of a scene that images like as well as the one that was found, or better.
 
 Where few points link cameras of an uncertain rig, a small turn of a camera explains them at almost any distance: along
 the scale the cost has a long flat tail, of which its curvature at the minimum knows nothing. Adjusted from other sizes,
-such a scene stays there at hardly any cost [the likelihood's profile].
+such a scene stays there at hardly any cost [the likelihood's profile], or finds a better one: a scene whose cameras
+were held while it grew, turned a little, has come to the size that explains their turns.
 
 A scene that is too large has lost the observations that say so. Counted by those that are left it is the best of all
 sizes. So every size takes up what fits it, and all observations count, those that do not fit by as much as one at the
 gate: the loss is truncated, and the choice of inliers is part of its minimum.
+
+Of two scenes the one of lower cost is the more likely, but by how much, few points may decide. The difference of their
+costs is known to what it scatters over points [Vuong, Likelihood Ratio Tests for Model Selection and Non-Nested
+Hypotheses, Econometrica 1989].
 """
 
 from __future__ import annotations
@@ -24,11 +29,45 @@ from mrasfm_engine.mapping.calibration import scale_scene, sigma_scale_of_images
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Floats, Ints
 
-FACTORS = 0.25, 0.5, 2.0, 4.0  # of the size
+Adjust = Callable[[Sequence[Term]], object]  # adjusts the mapper's scene by some terms
+Terms = Callable[[], Sequence[Term]]  # by the scene as it is: the weights of a gauge hold for one adjustment
+
+FACTORS = 0.5, 2.0, 0.25, 4.0  # of the size; nearer ones first
 UNSURE = 0.05  # of the scale by images alone: where they know it better, its curvature says how well
+SAME = 0.5 * UNSURE  # of two sizes: nearer ones hardly widen a scale that is unsure
 MOST_ROUNDS = 8  # of adjusting and taking up observations
 SMALL = 0.5  # half the square of a standard deviation
+CLEAR_SIGMAS = 3.0  # by which a scene is clearly more likely: its cost is lower by half the square, 4.5
 PARTS = "state", "motion", "triangulated", "is_inlier", "rejected"  # of a mapper, that an adjustment changes
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Cost of an adjusted scene."""
+
+    of_terms: float
+    of_tracks: Floats  # (tracks,) of all observations of each
+
+    @property
+    def total(self) -> float:
+        """Cost of everything."""
+        return self.of_terms + float(self.of_tracks.sum())
+
+    def sigmas_above(self, other: Cost) -> float:
+        """Standard deviations by which a scene of that cost is less likely than another one; 0 where it is not.
+
+        As many as the costs say, half the square of which they are apart, but no more than their difference has by its
+        scatter over tracks.
+        """
+        apart = max(self.total - other.total, 0.0)
+        by_track = self.of_tracks - other.of_tracks
+        changed = by_track[by_track != 0.0]
+        scatter = float(np.sqrt(len(changed)) * changed.std()) if len(changed) else 0.0
+        return min(float(np.sqrt(2.0 * apart)), apart / max(scatter, 1e-9))
+
+    def is_clearly_below(self, other: Cost) -> bool:
+        """True where a scene of this cost is clearly more likely than another one."""
+        return other.sigmas_above(self) >= CLEAR_SIGMAS
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,72 +75,103 @@ class SizedScenes:
     """Scenes that were adjusted from several sizes."""
 
     size_m: Floats  # (n,) where each has come to
-    cost: Floats  # (n,) of all observations and terms
-    _best: dict[str, object] = field(repr=False)  # parts of the mapper, of the most likely one
+    costs: Sequence[Cost]  # (n,) of all observations and terms
+    _parts: Sequence[dict[str, object]] = field(repr=False)  # (n,) of the mapper
 
-    def take_best(self, mapper: Mapper) -> None:
-        """Let the mapper have the most likely scene."""
-        _restore(mapper, self._best)
+    @property
+    def cost(self) -> Floats:
+        """Cost (n,) of each."""
+        return np.array([cost.total for cost in self.costs])
+
+    @property
+    def best(self) -> int:
+        """The one of least cost."""
+        return int(self.cost.argmin())
+
+    @property
+    def likely(self) -> int:
+        """The one of least cost where it is clearly more likely than the first one, else the first."""
+        return self.best if self.costs[self.best].is_clearly_below(self.costs[0]) else 0
+
+    def take(self, which: int, mapper: Mapper) -> None:
+        """Let the mapper have one of the scenes."""
+        _restore(mapper, self._parts[which])
 
     def sigma_of_scale(self, of_size_m: float) -> float:
         """Standard deviation, relative, of one of these sizes that the costs of all leave.
 
-        A size that costs half the square of n more than the best is n standard deviations away.
+        A size that is n standard deviations less likely than the best is as many away.
         """
-        sigmas = np.sqrt(np.maximum(2.0 * (self.cost - self.cost.min()), 1.0))
+        sigmas = np.maximum([cost.sigmas_above(self.costs[self.best]) for cost in self.costs], 1.0)
         return float((np.abs(np.log(self.size_m / of_size_m)) / sigmas).max())
 
 
 def scenes_of_sizes(
-    mapper: Mapper,
-    factors: Sequence[float],
-    adjust: Callable[[Sequence[Term]], object],
-    terms: Callable[[], Sequence[Term]],
-    options: SolverOptions,
+    mapper: Mapper, factors: Sequence[float], adjust: Adjust, terms: Terms, options: SolverOptions
 ) -> SizedScenes:
     """Adjust the mapper's scene from several sizes. The mapper is left as it was.
+
+    Sizes are not tried beyond one from which the scene comes to another that is known already, or stays where it is
+    clearly less likely: the cost rises that way.
 
     Parameters
     ----------
     factors
-        Of the size that it has.
-    adjust
-        Adjusts the mapper's scene by some terms, its cameras free under their prior.
-    terms
-        The terms by the scene as it is: the weights of a gauge hold for one adjustment.
+        Of the size that it has, nearer ones first.
+    adjust, terms
+        Of the adjustments, with cameras under their prior as they are to be free.
     options
-        Of the adjustment.
+        By which observations count.
     """
     kept, dropped = _parts_of(mapper), np.flatnonzero(mapper.rejected)
-    sizes_m, costs, best = list[float](), list[float](), kept
+    sizes_m, costs, parts, ends = list[float](), list[Cost](), list[dict[str, object]](), list[float]()
     try:
         for factor in factors:
+            if any(_is_beyond(factor, end) for end in ends):
+                continue
             _restore(mapper, copy.deepcopy(kept))
             scale_scene(mapper, factor)
-            costs.append(_adjusted_cost(mapper, dropped, adjust, terms, options))
+            cost = _adjusted_cost(mapper, dropped, adjust, terms, options, sizes_m)
+            if _is_known(size_m(mapper), sizes_m) or any(known.is_clearly_below(cost) for known in costs):
+                ends.append(factor)
             sizes_m.append(size_m(mapper))
-            if costs[-1] == min(costs):
-                best = _parts_of(mapper)
+            costs.append(cost)
+            parts.append(_parts_of(mapper))
     finally:
         _restore(mapper, kept)
-    return SizedScenes(size_m=np.array(sizes_m), cost=np.array(costs), _best=best)
+    return SizedScenes(size_m=np.array(sizes_m), costs=costs, _parts=parts)
 
 
-def with_other_sizes(
-    mapper: Mapper,
-    certainty: Covariances,
-    adjust: Callable[[Sequence[Term]], object],
-    terms: Callable[[], Sequence[Term]],
-    options: SolverOptions,
-) -> Covariances:
+def scenes_of_other_sizes(
+    mapper: Mapper, certainty: Covariances, adjust: Adjust, terms: Terms, options: SolverOptions
+) -> SizedScenes | None:
+    """The scene adjusted from its own size, the first, and from `FACTORS` of it; None where images know its scale."""
+    if not UNSURE < sigma_scale_of_images(mapper, certainty) < np.inf:
+        return None
+    return scenes_of_sizes(mapper, (1.0, *FACTORS), adjust, terms, options)
+
+
+def cost_as_found(mapper: Mapper, options: SolverOptions) -> Cost:
+    """Cost of the scene as it is, with all observations that fit it.
+
+    Terms are left out, in favour of what was found: those of its cameras may have had other weights when it was
+    adjusted, or none.
+    """
+    return scenes_of_sizes(mapper, [1.0], lambda terms: None, list, options).costs[0]
+
+
+def is_another_size(size: float, other: float, *, near: float = 0.0) -> bool:
+    """True where two sizes differ by more than hardly matters where the scale is unsure, and than `near`, relative."""
+    return abs(float(np.log(size / other))) > max(SAME, near)
+
+
+def with_other_sizes(mapper: Mapper, certainty: Covariances, scenes: SizedScenes) -> Covariances:
     """The certainty with a scale no better known than sizes of equal cost leave it; see `scenes_of_sizes`.
 
     Of a scene that costs the same at all sizes the sigma is as far as they were tried, the logarithm of the largest of
     `FACTORS`.
     """
-    if not UNSURE < sigma_scale_of_images(mapper, certainty) < np.inf:
-        return certainty
-    sigma = scenes_of_sizes(mapper, (1.0, *FACTORS), adjust, terms, options).sigma_of_scale(size_m(mapper))
+    sigma = scenes.sigma_of_scale(size_m(mapper))
     return certainty.with_scale_error(float(np.sqrt(max(sigma**2 - certainty.sigma_scale**2, 0.0))))
 
 
@@ -111,31 +181,47 @@ def size_m(mapper: Mapper) -> float:
     return max(float(np.linalg.norm(position_m - position_m.mean(axis=0))), 1e-9)
 
 
+def _is_known(size: float, sizes: Sequence[float]) -> bool:
+    return not all(is_another_size(size, known) for known in sizes)
+
+
+def _is_beyond(factor: float, nearer: float) -> bool:
+    """True where a factor is on one side of 1 with another, and farther away."""
+    return bool(np.log(factor) / np.log(nearer) > 1.0) if nearer != 1.0 else False
+
+
 def _adjusted_cost(
     mapper: Mapper,
     dropped: Ints,
-    adjust: Callable[[Sequence[Term]], object],
-    terms: Callable[[], Sequence[Term]],
+    adjust: Adjust,
+    terms: Terms,
     options: SolverOptions,
-) -> float:
-    """Cost of the scene, adjusted with what fits it until that changes no more."""
-    least, best = np.inf, _parts_of(mapper)
+    sizes_m: Sequence[float],
+) -> Cost:
+    """Cost of the scene, adjusted with what fits it until that changes no more, or it has come to a size (n,) that is
+    known.
+    """
+    least, best = None, _parts_of(mapper)
     for _ in range(MOST_ROUNDS):
+        if least is not None:
+            best = copy.deepcopy(_parts_of(mapper))
+            mapper.complete()
+            mapper.drop(dropped)
         known = terms()
         adjust(known)
         cost = _cost(mapper, known, options)
-        if cost >= least:
+        gain = np.inf if least is None else least.total - cost.total
+        if least is not None and gain <= 0.0:
+            _restore(mapper, best)
             break
-        gain, least, best = least - cost, cost, copy.deepcopy(_parts_of(mapper))
-        if gain < SMALL:
+        least = cost
+        if gain < SMALL or _is_known(size_m(mapper), sizes_m):
             break
-        mapper.complete()
-        mapper.drop(dropped)
-    _restore(mapper, best)
+    assert least is not None
     return least
 
 
-def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> float:
+def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> Cost:
     """Cost of the terms, and of all observations of tracks that were not dropped: at most as of one at the gate."""
     of_keypoint = mapper.tracks.of_keypoint
     rows = np.flatnonzero((of_keypoint >= 0) & mapper.registered[mapper.keypoints.unit])
@@ -147,8 +233,11 @@ def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> floa
         mapper.triangulator.errors_px(mapper.state, seen, mapper.state.points_m, of_keypoint[seen]),
         mapper.triangulator.max_error_px,
     )
-    of_images = np.log1p((errors_px / (options.loss_scale * options.sigma_px)) ** 2).sum()
-    return float(0.5 * options.loss_scale**2 * of_images + sum(term.cost(mapper.state) for term in terms))
+    costs = 0.5 * options.loss_scale**2 * np.log1p((errors_px / (options.loss_scale * options.sigma_px)) ** 2)
+    return Cost(
+        of_terms=sum(term.cost(mapper.state) for term in terms),
+        of_tracks=np.bincount(of_keypoint[rows], weights=costs, minlength=len(mapper.tracks)).astype(np.float64),
+    )
 
 
 def _parts_of(mapper: Mapper) -> dict[str, object]:

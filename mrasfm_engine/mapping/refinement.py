@@ -39,10 +39,20 @@ from mrasfm_engine.mapping.miscalibration import (
     find_wrong_pair,
 )
 from mrasfm_engine.mapping.moving_objects import drop_moving
-from mrasfm_engine.mapping.other_sizes import with_other_sizes
+from mrasfm_engine.mapping.other_sizes import (
+    CLEAR_SIGMAS,
+    SizedScenes,
+    cost_as_found,
+    is_another_size,
+    scenes_of_other_sizes,
+    size_m,
+    with_other_sizes,
+)
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.receiver_findings import contradicts_rig
 from mrasfm_engine.mapping.refinement_result import (
+    DECREMENT_TOLERANCE,
+    ROUGH_DECREMENT_TOLERANCE,
     Refinement,
     certainty_of,
     free_units_of,
@@ -65,6 +75,7 @@ from mrasfm_engine.mapping.time_offsets import (
 from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
+OF_ANOTHER_SIZE = "a scene of another size, with cameras that vary, is clearly more likely"
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions or time offsets change
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
@@ -97,7 +108,11 @@ def refine(
     result.sigma_px = observation_sigma_px(mapper)
     _decide_what_varies(mapper, result, free_units, is_calibrated=calibrated is not None, cancel=cancel)
     _adjust_in_rounds(mapper, result, free_units, progress, cancel)
+    result.certainty = certainty_of(mapper, result)
+    _compare_with_other_sizes(mapper, result, free_units, cancel)
     _assess(mapper, result, free_units, cancel)
+    if progress is not None:
+        progress(ROUNDS + 1, ROUNDS + 1)
     return result
 
 
@@ -174,17 +189,9 @@ def _adjust_in_rounds(
         if done == 0:
             _hear_given_rotations(mapper, result, free_units)
         _choose_observations(mapper, result, is_last=is_last)
-        if mapper.registered.sum() < 2:
-            raise ReconstructionError(
-                "adjusted together, no two units keep enough of what they observe: images contradict one another, "
-                "the rig, or positions",
-                remedy="Check the times of images and positions, and rig.cameras.",
-                code="contradictory-drive",
-            )
         done += 1
         if progress is not None:
-            progress(min(done, ROUNDS), ROUNDS)
-    result.units_dropped = sorted(set(result.units_dropped))
+            progress(min(done, ROUNDS), ROUNDS + 1)
 
 
 def _hear_given_rotations(mapper: Mapper, result: Refinement, free_units: Bools) -> None:
@@ -216,7 +223,13 @@ def _weigh_shared_errors(mapper: Mapper, result: Refinement) -> None:
 
 
 def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -> None:
-    """Take up what fits the adjusted scene, and drop what does not, what moves, and what is off the road's surface."""
+    """Take up what fits the adjusted scene, and drop what does not, what moves, and what is off the road's surface.
+
+    Raises
+    ------
+    ReconstructionError
+        Where fewer than two units are left.
+    """
     if is_last:
         mapper.readmit()
     else:
@@ -230,20 +243,73 @@ def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -
         mapper.drop(result.moving.tracks)
     if mapper.config.mapping.semantic_triangulation:
         result.road = drop_off_road(mapper, for_map=is_last, before=result.road)
-    result.units_dropped += mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers).tolist()
+    lost = mapper.drop_unsupported(mapper.config.mapping.min_pnp_inliers)
+    result.units_dropped = sorted({*result.units_dropped, *lost.tolist()})
+    if mapper.registered.sum() < 2:
+        raise ReconstructionError(
+            "adjusted together, no two units keep enough of what they observe: images contradict one another, "
+            "the rig, or positions",
+            remedy="Check the times of images and positions, and rig.cameras.",
+            code="contradictory-drive",
+        )
+
+
+def _compare_with_other_sizes(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
+    """Compare the scene with itself adjusted from other sizes, and take the one that is clearly more likely.
+
+    All sizes widen the certainty as far as they are likely; they do no more where cameras have to stay as they are.
+    """
+    if result.certainty is None or result.georeferenced or mapper.drive.has_single_camera:
+        return
+    scenes = scenes_of_other_sizes(
+        mapper,
+        result.certainty,
+        lambda terms: _adjust_all_cameras(mapper, result, free_units, terms, cancel),
+        lambda: terms_of_all_cameras(mapper, result),
+        solver_options(mapper, result),
+    )
+    if scenes is None:
+        return
+    if _is_of_another_size(mapper, result, scenes):
+        scenes.take(scenes.likely, mapper)
+        _refine_with_all_cameras(mapper, result, free_units, cancel)
+    if result.certainty is not None:
+        result.certainty = with_other_sizes(mapper, result.certainty, scenes)
+
+
+def _is_of_another_size(mapper: Mapper, result: Refinement, scenes: SizedScenes) -> bool:
+    """True where a scene of another size is clearly more likely than the one that was found, and may take its place.
+
+    A scene whose cameras have varied is at a minimum, whose certainty holds the sizes near it. What others cost, errors
+    that observations share may decide there.
+    """
+    assert result.certainty is not None
+    if not (result.calibration.free or result.calibration.is_open) or not _reassesses(mapper):
+        return False
+    near = CLEAR_SIGMAS * result.certainty.sigma_scale if result.calibration.free else 0.0
+    if not is_another_size(scenes.size_m[scenes.likely], size_m(mapper), near=near):
+        return False
+    return scenes.costs[scenes.likely].is_clearly_below(cost_as_found(mapper, solver_options(mapper, result)))
+
+
+def _refine_with_all_cameras(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
+    """Adjust a scene in which all cameras have varied, as the last round does, and choose its observations."""
+    if not result.calibration.free:
+        result.calibration = CalibrationDecision(True, OF_ANOTHER_SIZE)
+    result.recalibrated[:] = True
+    result.times_vary = times_may_vary(mapper)
+    result.given_scale, result.sigma_factor = None, 1.0
+    result.sigma_px = observation_sigma_px(mapper)
+    _hear_given_rotations(mapper, result, free_units)
+    _weigh_shared_errors(mapper, result)
+    _adjust(mapper, result, free_units, rough=False, cancel=cancel)
+    _reassess(mapper, result)
+    _choose_observations(mapper, result, is_last=True)
+    result.certainty = certainty_of(mapper, result)
 
 
 def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
     """Say how certain everything is, hold what the drive does not observe, and find what is not as it was given."""
-    result.certainty = certainty_of(mapper, result)
-    if result.certainty is not None and not result.georeferenced and not mapper.drive.has_single_camera:
-        result.certainty = with_other_sizes(
-            mapper,
-            result.certainty,
-            lambda terms: _adjust_all_cameras(mapper, result, free_units, terms, cancel),
-            lambda: terms_of_all_cameras(mapper, result),
-            solver_options(mapper, result),
-        )
     _compare_rough_poses_with_rig(mapper, result)
     result.directions = observed_directions(mapper, result.certainty)
     mean_time_varied = result.mean_time_varies
@@ -322,14 +388,19 @@ def _adjust(
 def _adjust_all_cameras(
     mapper: Mapper, result: Refinement, free_units: Bools, terms: Sequence[Term], cancel: Cancel | None
 ) -> Report:
-    """Adjust by some terms with all cameras and their times free under their priors, those that are held as well."""
+    """Adjust by some terms with all cameras and their times free under their priors, those that are held as well.
+
+    Scenes of many units have nearly their shape, and end earlier on their way along a flat scale. Few units, which
+    take little time, go far.
+    """
+    tolerance = DECREMENT_TOLERANCE if has_few_units(mapper) else ROUGH_DECREMENT_TOLERANCE
     return adjust_poses(
         mapper,
         free_units & mapper.registered,
         free_cameras=np.ones(len(mapper.camera_kind), dtype=np.bool_),
         free_times=np.full(len(mapper.camera_kind), times_may_vary(mapper)),
         terms=terms,
-        options=solver_options(mapper, result),
+        options=replace(solver_options(mapper, result), decrement_tolerance=tolerance),
         cancel=cancel,
     )
 
@@ -386,7 +457,7 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
     if wrong.any() and (~wrong).sum() < MIN_OTHERS:
         result.calibration = CalibrationDecision(True, "images contradict what was given")
         return
-    result.calibration = CalibrationDecision(False, FEW_UNITS)
+    result.calibration = CalibrationDecision(False, FEW_UNITS, is_open=True)
     result.recalibrated = wrong
     mapper.begin_anew(~wrong)
 

@@ -53,7 +53,7 @@ def compare_positions_again(mapper: Mapper, result: Refinement, cancel: Cancel |
         weighed.terms,
         weighed.options,
     )
-    scenes.take_best(mapper)
+    scenes.take(scenes.best, mapper)
     scene.place(scene.certainty() or known, sigma_of_sizes=scenes.sigma_of_scale(size_m(mapper)))
 
 
