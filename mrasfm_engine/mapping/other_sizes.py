@@ -3,7 +3,7 @@
 Where few points link cameras of an uncertain rig, a small turn of a camera explains them at almost any distance: along
 the scale the cost has a long flat tail, of which its curvature at the minimum knows nothing. Adjusted from other sizes,
 such a scene stays there at hardly any cost [the likelihood's profile], or finds a better one: a scene whose cameras
-were held while it grew, turned a little, has come to the size that explains their turns.
+are held, turned a little, has come to the size that explains their turns.
 
 A scene that is too large has lost the observations that say so. Counted by those that are left it is the best of all
 sizes. So every size takes up what fits it, and all observations count, those that do not fit by as much as one at the
@@ -30,6 +30,7 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Floats, Ints
 
 Adjust = Callable[[Sequence[Term]], object]  # adjusts the mapper's scene by some terms
+Parts = dict[str, object]  # of a mapper, that an adjustment changes
 Terms = Callable[[], Sequence[Term]]  # by the scene as it is: the weights of a gauge hold for one adjustment
 
 FACTORS = 0.5, 2.0, 0.25, 4.0  # of the size; nearer ones first
@@ -38,7 +39,7 @@ SAME = 0.5 * UNSURE  # of two sizes: nearer ones hardly widen a scale that is un
 MOST_ROUNDS = 8  # of adjusting and taking up observations
 SMALL = 0.5  # half the square of a standard deviation
 CLEAR_SIGMAS = 3.0  # by which a scene is clearly more likely: its cost is lower by half the square, 4.5
-PARTS = "state", "motion", "triangulated", "is_inlier", "rejected"  # of a mapper, that an adjustment changes
+NAMES_OF_PARTS = "state", "motion", "triangulated", "is_inlier", "rejected"
 
 
 @dataclass(frozen=True)
@@ -60,9 +61,9 @@ class Cost:
         scatter over tracks.
         """
         apart = max(self.total - other.total, 0.0)
-        by_track = self.of_tracks - other.of_tracks
-        changed = by_track[by_track != 0.0]
-        scatter = float(np.sqrt(len(changed)) * changed.std()) if len(changed) else 0.0
+        observed = (self.of_tracks > 0.0) | (other.of_tracks > 0.0)
+        by_track = (self.of_tracks - other.of_tracks)[observed]
+        scatter = float(np.sqrt(len(by_track)) * by_track.std()) if len(by_track) else 0.0
         return min(float(np.sqrt(2.0 * apart)), apart / max(scatter, 1e-9))
 
     def is_clearly_below(self, other: Cost) -> bool:
@@ -76,7 +77,7 @@ class SizedScenes:
 
     size_m: Floats  # (n,) where each has come to
     costs: Sequence[Cost]  # (n,) of all observations and terms
-    _parts: Sequence[dict[str, object]] = field(repr=False)  # (n,) of the mapper
+    _parts: Sequence[Parts] = field(repr=False)  # (n,) of the mapper
 
     @property
     def cost(self) -> Floats:
@@ -100,14 +101,23 @@ class SizedScenes:
     def sigma_of_scale(self, of_size_m: float) -> float:
         """Standard deviation, relative, of one of these sizes that the costs of all leave.
 
-        A size that is n standard deviations less likely than the best is as many away.
+        A size that is n standard deviations less likely than the best is as many away. One that is clearly less likely
+        counts no farther than sizes are tried: a scene that has lost its scale is at any.
         """
         sigmas = np.maximum([cost.sigmas_above(self.costs[self.best]) for cost in self.costs], 1.0)
-        return float((np.abs(np.log(self.size_m / of_size_m)) / sigmas).max())
+        away = np.abs(np.log(self.size_m / of_size_m))
+        away[sigmas >= CLEAR_SIGMAS] = np.minimum(away[sigmas >= CLEAR_SIGMAS], np.log(max(FACTORS)))
+        return float((away / sigmas).max())
 
 
 def scenes_of_sizes(
-    mapper: Mapper, factors: Sequence[float], adjust: Adjust, terms: Terms, options: SolverOptions
+    mapper: Mapper,
+    factors: Sequence[float],
+    adjust: Adjust,
+    terms: Terms,
+    options: SolverOptions,
+    *,
+    as_grown: Parts | None = None,
 ) -> SizedScenes:
     """Adjust the mapper's scene from several sizes. The mapper is left as it was.
 
@@ -122,33 +132,48 @@ def scenes_of_sizes(
         Of the adjustments, with cameras under their prior as they are to be free.
     options
         By which observations count.
+    as_grown
+        Another scene of the same units to begin with, tried after the first size.
     """
-    kept, dropped = _parts_of(mapper), np.flatnonzero(mapper.rejected)
-    sizes_m, costs, parts, ends = list[float](), list[Cost](), list[dict[str, object]](), list[float]()
+    kept, dropped = parts_of(mapper), np.flatnonzero(mapper.rejected)
+    starts = [(kept, factor) for factor in factors]
+    if as_grown is not None:
+        starts.insert(1, (as_grown, 1.0))
+    sizes_m, costs, parts, ends = list[float](), list[Cost](), list[Parts](), list[float]()
     try:
-        for factor in factors:
+        for start, factor in starts:
             if any(_is_beyond(factor, end) for end in ends):
                 continue
-            _restore(mapper, copy.deepcopy(kept))
-            scale_scene(mapper, factor)
+            _begin_with(mapper, start, factor, dropped)
             cost = _adjusted_cost(mapper, dropped, adjust, terms, options, sizes_m)
             if _is_known(size_m(mapper), sizes_m) or any(known.is_clearly_below(cost) for known in costs):
                 ends.append(factor)
             sizes_m.append(size_m(mapper))
             costs.append(cost)
-            parts.append(_parts_of(mapper))
+            parts.append(parts_of(mapper))
     finally:
         _restore(mapper, kept)
     return SizedScenes(size_m=np.array(sizes_m), costs=costs, _parts=parts)
 
 
 def scenes_of_other_sizes(
-    mapper: Mapper, certainty: Covariances, adjust: Adjust, terms: Terms, options: SolverOptions
+    mapper: Mapper,
+    certainty: Covariances,
+    adjust: Adjust,
+    terms: Terms,
+    options: SolverOptions,
+    *,
+    as_grown: Parts | None = None,
 ) -> SizedScenes | None:
-    """The scene adjusted from its own size, the first, and from `FACTORS` of it; None where images know its scale."""
-    if not UNSURE < sigma_scale_of_images(mapper, certainty) < np.inf:
+    """The scene adjusted from its own size, the first, from `as_grown`, and from `FACTORS` of its size.
+
+    None where images know its scale. Where they do not know it at all, no other size differs from its own.
+    """
+    sigma = sigma_scale_of_images(mapper, certainty)
+    if sigma <= UNSURE or (as_grown is None and not sigma < np.inf):
         return None
-    return scenes_of_sizes(mapper, (1.0, *FACTORS), adjust, terms, options)
+    factors = FACTORS if sigma < np.inf else ()
+    return scenes_of_sizes(mapper, (1.0, *factors), adjust, terms, options, as_grown=as_grown)
 
 
 def cost_as_found(mapper: Mapper, options: SolverOptions) -> Cost:
@@ -181,6 +206,24 @@ def size_m(mapper: Mapper) -> float:
     return max(float(np.linalg.norm(position_m - position_m.mean(axis=0))), 1e-9)
 
 
+def parts_of(mapper: Mapper) -> Parts:
+    """Parts of the mapper as they are; they change with its next adjustment, unless copied."""
+    return {name: getattr(mapper, name) for name in NAMES_OF_PARTS}
+
+
+def _restore(mapper: Mapper, parts: Parts) -> None:
+    for name, part in parts.items():
+        setattr(mapper, name, part)
+
+
+def _begin_with(mapper: Mapper, parts: Parts, factor: float, dropped: Ints) -> None:
+    """Let the mapper have a copy of a scene in another size, without the tracks (n,) and units that were dropped."""
+    _restore(mapper, copy.deepcopy(parts))
+    mapper.forget(np.flatnonzero(~mapper.registered))
+    mapper.drop(dropped)
+    scale_scene(mapper, factor)
+
+
 def _is_known(size: float, sizes: Sequence[float]) -> bool:
     return not all(is_another_size(size, known) for known in sizes)
 
@@ -201,10 +244,10 @@ def _adjusted_cost(
     """Cost of the scene, adjusted with what fits it until that changes no more, or it has come to a size (n,) that is
     known.
     """
-    least, best = None, _parts_of(mapper)
+    least, best = None, parts_of(mapper)
     for _ in range(MOST_ROUNDS):
         if least is not None:
-            best = copy.deepcopy(_parts_of(mapper))
+            best = copy.deepcopy(parts_of(mapper))
             mapper.complete()
             mapper.drop(dropped)
         known = terms()
@@ -238,12 +281,3 @@ def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> Cost
         of_terms=sum(term.cost(mapper.state) for term in terms),
         of_tracks=np.bincount(of_keypoint[rows], weights=costs, minlength=len(mapper.tracks)).astype(np.float64),
     )
-
-
-def _parts_of(mapper: Mapper) -> dict[str, object]:
-    return {name: getattr(mapper, name) for name in PARTS}
-
-
-def _restore(mapper: Mapper, parts: dict[str, object]) -> None:
-    for name, part in parts.items():
-        setattr(mapper, name, part)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -44,6 +45,7 @@ from mrasfm_engine.mapping.other_sizes import (
     SizedScenes,
     cost_as_found,
     is_another_size,
+    parts_of,
     scenes_of_other_sizes,
     size_m,
     with_other_sizes,
@@ -267,6 +269,7 @@ def _compare_with_other_sizes(mapper: Mapper, result: Refinement, free_units: Bo
         lambda terms: _adjust_all_cameras(mapper, result, free_units, terms, cancel),
         lambda: terms_of_all_cameras(mapper, result),
         solver_options(mapper, result),
+        as_grown=result.as_grown,
     )
     if scenes is None:
         return
@@ -459,6 +462,7 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
         return
     result.calibration = CalibrationDecision(False, FEW_UNITS, is_open=True)
     result.recalibrated = wrong
+    result.as_grown = copy.deepcopy(parts_of(mapper))
     mapper.begin_anew(~wrong)
 
 

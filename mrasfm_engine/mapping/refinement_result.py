@@ -21,6 +21,7 @@ from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, intrinsics_prio
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import MiscalibratedPair, Miscalibration
 from mrasfm_engine.mapping.moving_objects import MovingTracks
+from mrasfm_engine.mapping.other_sizes import Parts
 from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.road import RoadAssessment
 from mrasfm_engine.mapping.time_offsets import (
@@ -55,6 +56,7 @@ class Refinement:
     mean_time_varies: bool = False
     times: TimeCertainty | None = None  # of the cameras' time offsets; None where it is not known
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
+    as_grown: Parts | None = None  # the scene before cameras were put back to where they began
     adjustments: list[Report] = field(default_factory=list)
     observations_dropped: int = 0
     points_dropped: int = 0
