@@ -220,6 +220,7 @@ def _begin_with(mapper: Mapper, parts: Parts, factor: float, dropped: Ints) -> N
     """Let the mapper have a copy of a scene in another size, without the tracks (n,) and units that were dropped."""
     _restore(mapper, copy.deepcopy(parts))
     mapper.forget(np.flatnonzero(~mapper.registered))
+    mapper.rejected[:] = False
     mapper.drop(dropped)
     scale_scene(mapper, factor)
 

@@ -80,6 +80,7 @@ OF_THE_LARGEST = "it is that of the drive's largest component"
 OF_ANOTHER_SIZE = "a scene of another size, with cameras that vary, is clearly more likely"
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
 MAX_ROUNDS = 6  # and while the weights of positions or time offsets change
+MOST_COMPARISONS = 3  # with other sizes, each from the one that the last has found
 MAX_UNBENDING = 6  # adjustments before them while positions contradict the scene's shape,
 STRAIGHTENED = 0.7  # and each leaves at most so much of it
 BOTH_RIGHT_SIGMAS = 2.0  # of the scales by rough poses and by the rig as given, within which both may be right
@@ -259,11 +260,31 @@ def _choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) -
 def _compare_with_other_sizes(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
     """Compare the scene with itself adjusted from other sizes, and take the one that is clearly more likely.
 
-    All sizes widen the certainty as far as they are likely; they do no more where cameras have to stay as they are.
+    What was taken is compared again: it may have been on its way. The sizes of the last comparison widen the certainty
+    as far as they are likely; they do no more where cameras have to stay as they are.
     """
-    if result.certainty is None or result.georeferenced or mapper.drive.has_single_camera:
+    if result.georeferenced or mapper.drive.has_single_camera:
         return
-    scenes = scenes_of_other_sizes(
+    compared: SizedScenes | None = None
+    for _ in range(MOST_COMPARISONS):
+        scenes = None if result.certainty is None else _scenes_of_other_sizes(mapper, result, free_units, cancel)
+        if scenes is None:
+            break
+        compared = scenes
+        if not _is_of_another_size(mapper, result, scenes):
+            break
+        scenes.take(scenes.likely, mapper)
+        _refine_with_all_cameras(mapper, result, free_units, cancel)
+    if compared is not None and result.certainty is not None:
+        result.certainty = with_other_sizes(mapper, result.certainty, compared)
+
+
+def _scenes_of_other_sizes(
+    mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None
+) -> SizedScenes | None:
+    """The scene adjusted from several sizes, with all cameras free; None where images know its scale."""
+    assert result.certainty is not None
+    return scenes_of_other_sizes(
         mapper,
         result.certainty,
         lambda terms: _adjust_all_cameras(mapper, result, free_units, terms, cancel),
@@ -271,13 +292,6 @@ def _compare_with_other_sizes(mapper: Mapper, result: Refinement, free_units: Bo
         solver_options(mapper, result),
         as_grown=result.as_grown,
     )
-    if scenes is None:
-        return
-    if _is_of_another_size(mapper, result, scenes):
-        scenes.take(scenes.likely, mapper)
-        _refine_with_all_cameras(mapper, result, free_units, cancel)
-    if result.certainty is not None:
-        result.certainty = with_other_sizes(mapper, result.certainty, scenes)
 
 
 def _is_of_another_size(mapper: Mapper, result: Refinement, scenes: SizedScenes) -> bool:
@@ -300,6 +314,7 @@ def _refine_with_all_cameras(mapper: Mapper, result: Refinement, free_units: Boo
     if not result.calibration.free:
         result.calibration = CalibrationDecision(True, OF_ANOTHER_SIZE)
     result.recalibrated[:] = True
+    result.as_grown = None
     result.times_vary = times_may_vary(mapper)
     result.given_scale, result.sigma_factor = None, 1.0
     result.sigma_px = observation_sigma_px(mapper)
