@@ -39,22 +39,30 @@ class SimulatedObservations:
     is_outlier: Bools  # (observations,), where xy_px is anywhere in the image
 
 
-def simulate_trajectory(units: int, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
+def simulate_trajectory(
+    units: int, *, spacing_m: float = 1.1, straight: bool = False, radius_m: float | None = None
+) -> Floats:
     """`world_from_rig` (units, 4, 4) of a car on a gently winding (or straight) flat street, world z up.
 
-    Over 40 units of 1.1 m the heading of the winding street varies by 29 degrees.
+    Over 40 units of 1.1 m the heading of the winding street varies by 29 degrees. With a radius the rig's origin, which
+    is at the rear axle, goes round a circle to the left.
     """
     travelled_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
-    return poses_along(travelled_m, spacing_m=spacing_m, straight=straight)
+    return poses_along(travelled_m, spacing_m=spacing_m, straight=straight, radius_m=radius_m)
 
 
-def poses_along(travelled_m: Floats, *, spacing_m: float = 1.1, straight: bool = False) -> Floats:
+def poses_along(
+    travelled_m: Floats, *, spacing_m: float = 1.1, straight: bool = False, radius_m: float | None = None
+) -> Floats:
     """Poses (n, 4, 4) of the car of `simulate_trajectory` after any distance (n,), also before its first unit."""
 
     def heading(s: Floats) -> Floats:
-        swing = (
-            np.zeros_like(s) if straight else np.radians(24.0) * np.sin(s / 19.0) + np.radians(5.0) * np.sin(s / 4.0)
-        )
+        if radius_m is not None:
+            swing = s / radius_m
+        elif straight:
+            swing = np.zeros_like(s)
+        else:
+            swing = np.radians(24.0) * np.sin(s / 19.0) + np.radians(5.0) * np.sin(s / 4.0)
         result: Floats = np.radians(25.0) + swing
         return result
 
@@ -110,6 +118,7 @@ def simulate_observations(
     outlier_fraction: float = 0.0,
     spacing_m: float = 1.1,
     straight: bool = False,
+    radius_m: float | None = None,
     max_depth_m: float = 60.0,
     image_size_px: tuple[int, int] = (960, 540),
     time_offset_s: ArrayLike = 0.0,
@@ -132,6 +141,8 @@ def simulate_observations(
         Distance between units.
     straight
         Whether the street is straight.
+    radius_m
+        Radius of the circle that the street is.
     max_depth_m
         Farther points are not seen.
     image_size_px
@@ -162,10 +173,12 @@ def simulate_observations(
     params = np.array([camera.params for camera in rig])
     steady_m = (np.arange(units) * _FINE).astype(np.float64) * (spacing_m / _FINE)
     along_m = steady_m if travelled_m is None else np.asarray(travelled_m, dtype=np.float64)
-    world_from_rig = poses_along(along_m, spacing_m=spacing_m, straight=straight)
+    world_from_rig = poses_along(along_m, spacing_m=spacing_m, straight=straight, radius_m=radius_m)
     steps = max(2, round(float(np.ptp(along_m)) / spacing_m) + 1)
     along = (
-        world_from_rig if travelled_m is None else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight)
+        world_from_rig
+        if travelled_m is None
+        else simulate_trajectory(steps, spacing_m=spacing_m, straight=straight, radius_m=radius_m)
     )
     world = _points_along(along, points, rng)
 
@@ -185,7 +198,7 @@ def simulate_observations(
             then_m = at_s * RATE_HZ * spacing_m
             if travelled_m is not None:
                 then_m = np.interp(at_s * RATE_HZ, np.arange(units), along_m)
-            then = poses_along(then_m, spacing_m=spacing_m, straight=straight)
+            then = poses_along(then_m, spacing_m=spacing_m, straight=straight, radius_m=radius_m)
             local = se3.apply(se3.inverse(then @ rig_from_cam[which[1]]), world[which[2], None])[:, 0]
             xy[which] = local[:, :2] / local[:, 2:].clip(0.3) * params[which[1], :2] + params[which[1], 2:]
         seen[which] = (local[:, 2] > 0.3) & np.all((xy[which] > 0) & (xy[which] < np.array([width, height])), -1)
