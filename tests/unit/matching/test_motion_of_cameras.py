@@ -13,14 +13,23 @@ from mrasfm_engine.scene.scene import PairMatches
 from tests.helpers.simulated_drive import SimulatedDrive, make_simulated_drive, true_matches, with_cameras
 from tests.unit.matching.test_simultaneous import rays_of_matches, relative_error_deg
 
-FRONT, BACK_LEFT = 0, 3  # of six, they share no view
+FRONT, BACK_LEFT, BACK = 0, 3, 5  # of six, no two share a view; the last is at the rear axle, 1.7 m behind the first
 
 
-def turned(rotation_deg: list[float], *, straight: bool = True, seed: int = 0) -> SimulatedDrive:
-    """A drive of two cameras without a common view; the one behind is given turned about the rig's axes."""
+def turned(
+    rotation_deg: list[float],
+    *,
+    straight: bool = True,
+    other: int = BACK_LEFT,
+    radius_m: float | None = None,
+    time_offset_ms: list[int] | None = None,
+    readout_ms: int = 0,
+    seed: int = 0,
+) -> SimulatedDrive:
+    """A drive of two cameras without a common view; the other one is given turned about the rig's axes."""
 
     def given(rig_from_cam: np.ndarray) -> np.ndarray:
-        rig_from_cam[BACK_LEFT, :3, :3] = se3.exp_so3(np.radians(rotation_deg)) @ rig_from_cam[BACK_LEFT, :3, :3]
+        rig_from_cam[other, :3, :3] = se3.exp_so3(np.radians(rotation_deg)) @ rig_from_cam[other, :3, :3]
         return rig_from_cam
 
     return make_simulated_drive(
@@ -28,8 +37,11 @@ def turned(rotation_deg: list[float], *, straight: bool = True, seed: int = 0) -
         cameras=6,
         points=1500,
         straight=straight,
+        radius_m=radius_m,
         given=given,
-        hidden=lambda unit, camera: camera not in (FRONT, BACK_LEFT),
+        hidden=lambda unit, camera: camera not in (FRONT, other),
+        time_offset_ms=time_offset_ms,
+        readout_ms=readout_ms,
         seed=seed,
     )
 
@@ -48,8 +60,15 @@ def by_motion(
     return rig_by_motion(simulated.drive, pairs, rays_of, rig, MatchConfig(), settings)
 
 
-def off_deg(simulated: SimulatedDrive, rig_from_cam: np.ndarray) -> float:
-    return relative_error_deg(rig_from_cam, simulated.truth.rig_from_cam, FRONT, BACK_LEFT)
+def off_deg(simulated: SimulatedDrive, rig_from_cam: np.ndarray, other: int = BACK_LEFT) -> float:
+    return relative_error_deg(rig_from_cam, simulated.truth.rig_from_cam, FRONT, other)
+
+
+def turn_off_deg(simulated: SimulatedDrive, rig_from_cam: np.ndarray) -> np.ndarray:
+    """Error (3,) of BACK_LEFT's rotation against FRONT's, about the rig's axes."""
+    by = rig_from_cam[:, :3, :3] @ np.swapaxes(simulated.truth.rig_from_cam[:, :3, :3], 1, 2)
+    result: np.ndarray = np.degrees(se3.log_so3(by[BACK_LEFT] @ by[FRONT].T))
+    return result
 
 
 @pytest.mark.parametrize("straight", [True, False])
@@ -83,9 +102,53 @@ def test_a_camera_without_a_common_view_that_is_turned_is_found(pitch_deg: float
 
 
 def test_roll_about_a_straight_street_stays_as_given() -> None:
-    """No motion tells it, and what is not told is not made up."""
-    found = by_motion(turned([6.0, 0.0, 0.0]))
-    assert not found.is_corrected
+    """No motion shows it, and a correction of another axis brings none of it."""
+    simulated = turned([6.0, 6.0, 0.0])
+    found = by_motion(simulated)
+    roll_deg, pitch_deg, yaw_deg = turn_off_deg(simulated, found.rig_from_cam)
+    assert abs(pitch_deg) < 2.0
+    assert roll_deg == pytest.approx(6.0, abs=1.0)
+    assert abs(yaw_deg) < 1.0
+
+
+def test_roll_is_found_where_the_street_winds() -> None:
+    simulated = turned([6.0, 6.0, 0.0], straight=False)
+    roll_deg, pitch_deg, _ = turn_off_deg(simulated, by_motion(simulated).rig_from_cam)
+    assert abs(pitch_deg) < 2.0
+    assert abs(roll_deg) < 3.5
+
+
+@pytest.mark.parametrize("other", [BACK_LEFT, BACK])
+def test_in_a_tight_turn_lever_arms_are_no_error_of_rotations(other: int) -> None:
+    """Cameras far from the rear axle move aside: their directions differ, and no camera is turned."""
+    simulated = turned([0.0, 0.0, 0.0], other=other, radius_m=5.0)
+    found = by_motion(simulated)
+    assert found.motions > 10
+    assert found.apart_before_rad[FRONT, other] > np.radians(5.0)
+    np.testing.assert_array_equal(found.rig_from_cam, simulated.drive.rig_from_cam)
+
+
+@pytest.mark.parametrize("other", [BACK_LEFT, BACK])
+@pytest.mark.parametrize("rotation_deg", [[6.0, 0.0, 0.0], [0.0, 6.0, 0.0]])
+def test_a_turned_camera_is_found_in_a_tight_turn(rotation_deg: list[float], other: int) -> None:
+    simulated = turned(rotation_deg, other=other, radius_m=5.0)
+    assert off_deg(simulated, by_motion(simulated).rig_from_cam, other) < 2.0
+
+
+# Cameras that are not simultaneous, with rolling shutters, of a vehicle that turns by 6 deg from unit to unit.
+LATE = {"radius_m": 10.0, "time_offset_ms": [0, 50, 50, 50, 50, 50], "readout_ms": 30}
+
+
+def test_cameras_that_are_not_simultaneous_are_not_turned_for_that() -> None:
+    simulated = turned([0.0, 0.0, 0.0], **LATE)  # type: ignore[arg-type]
+    found = by_motion(simulated)
+    assert found.motions > 10
+    np.testing.assert_array_equal(found.rig_from_cam, simulated.drive.rig_from_cam)
+
+
+def test_a_turned_camera_that_is_not_simultaneous_is_found() -> None:
+    simulated = turned([0.0, 6.0, 0.0], **LATE)  # type: ignore[arg-type]
+    assert off_deg(simulated, by_motion(simulated).rig_from_cam) < 2.0
 
 
 def test_settings_that_hold_the_calibration_hold_it() -> None:
