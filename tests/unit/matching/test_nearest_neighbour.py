@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import MatchConfig
-from mrasfm_engine.matching import integer_products
+from mrasfm_engine.matching import integer_products, nearest_neighbour
 from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, Prepared
 from mrasfm_engine.scene.scene import ImageFeatures
@@ -131,6 +131,39 @@ def test_products_of_bytes_are_exact(shape: tuple[int, int, int], signs: bool, m
         assert right_side(b).dtype == np.uint8
     products = product_of_bytes(a, right_side(b)) + missing(a)[:, None]
     assert np.array_equal(products, a.astype(np.int64) @ b.astype(np.int64).T)
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32])
+@pytest.mark.parametrize(("rows", "columns"), [(1, 40), (70, 40), (130, 65), (64, 4)])
+def test_matches_do_not_depend_on_how_many_rows_are_taken_at_a_time(
+    kind: type, rows: int, columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A last part that is shorter than the others, or of one row, is compared as well, and none twice."""
+    rng = np.random.default_rng(rows)
+    b = random_descriptors(columns, rng)
+    shared = columns // 2
+    a = np.concatenate([random_descriptors(rows, rng), b[rng.permutation(columns)[:shared]]])
+    matcher = NearestNeighbourMatcher(MatchConfig())
+    sides = [matcher.prepare(features(descriptors.astype(kind))) for descriptors in (a, b)]
+    found = []
+    for step in (1, 7, len(a) - 1, len(a), 10 * len(a)):
+        monkeypatch.setattr(nearest_neighbour, "_rows_at_a_time", lambda element, columns, step=step: step)
+        found.append(matcher.match(*sides))
+    assert len(found[0]) == shared
+    np.testing.assert_array_equal(a[found[0][:, 0]], b[found[0][:, 1]])
+    for other in found[1:]:
+        np.testing.assert_array_equal(other, found[0])
+
+
+@pytest.mark.parametrize("columns", [2, 511, 1500, 4096, 4097, 100_000])
+def test_products_that_exist_at_one_time_stay_in_the_cache(columns: int) -> None:
+    """Calls with hardly any rows cost more, and floats are not faster for it."""
+    rows = nearest_neighbour._rows_at_a_time(np.dtype(np.uint8), columns)
+    in_cache = nearest_neighbour.FEWEST_ROWS * columns <= nearest_neighbour.CACHED_PRODUCTS
+    assert rows >= nearest_neighbour.FEWEST_ROWS
+    assert rows == nearest_neighbour.ROWS or rows * columns <= nearest_neighbour.CACHED_PRODUCTS < (rows + 1) * columns
+    assert in_cache == (rows * columns <= nearest_neighbour.CACHED_PRODUCTS)
+    assert nearest_neighbour._rows_at_a_time(np.dtype(np.float32), columns) == nearest_neighbour.ROWS
 
 
 def test_float_descriptors_of_any_length_match_too() -> None:

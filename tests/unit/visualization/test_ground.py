@@ -100,6 +100,30 @@ def test_tiles_cover_what_is_asked_for() -> None:
         np.testing.assert_allclose(heights, 0.01 * x[None] ** 2 - 0.3 * y[:, None], atol=1e-9)
 
 
+def test_tiles_that_are_remembered_are_those_of_the_place() -> None:
+    """The last square is kept: it may be another one's only where both cover the same tiles."""
+
+    class Slope:
+        def height_m(self, xy_m: np.ndarray) -> np.ndarray:
+            result: np.ndarray = xy_m[:, 0] + 1000.0 * xy_m[:, 1]
+            return result
+
+    tiles = GroundTiles(Slope())
+    # Within a tile, of other last tiles, of other first ones, farther, larger, and back again.
+    places = [(3.0, 3.0, 2.0), (3.4, 3.1, 2.0), (6.0, 3.0, 2.0), (3.0, 3.0, 2.0), (3.0, 6.0, 2.0), (3.0, 3.0, 2.0)]
+    places += [(11.0, 3.0, 2.0), (9.0, 3.0, 2.0), (3.0, 11.0, 2.0), (3.0, 9.0, 2.0), (-5.0, 3.0, 2.0), (3.0, 3.0, 9.0)]
+    for x, y, reach_m in places:
+        heights, first = tiles.around(np.array([x, y]), reach_m)
+        rows, columns = np.indices(heights.shape)
+        expected = first[0] + HEIGHT_STEP_M * columns + 1000.0 * (first[1] + HEIGHT_STEP_M * rows)
+        np.testing.assert_array_equal(heights, expected)
+        last = first + HEIGHT_STEP_M * np.array([heights.shape[1] - 1, heights.shape[0] - 1])
+        assert (first <= [x - reach_m, y - reach_m]).all()
+        assert (last >= [x + reach_m, y + reach_m]).all()
+    one, other = (tiles.around(np.array([x, 3.0]), 2.0)[0] for x in (3.0, 3.4))
+    assert other is one  # not put together again
+
+
 def test_bonnets_of_cars_in_a_line_are_not_the_ground() -> None:
     rng = np.random.default_rng(4)
     road = street(rng, on_road=400)
