@@ -18,6 +18,7 @@ import numpy as np
 
 from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.features.extraction import Extractor, ImageMasks, one_opencv_thread
 from mrasfm_engine.features.segmentation import Segmenter
 from mrasfm_engine.io.images import read_image_rgb
@@ -141,7 +142,7 @@ def _sample(drive: Drive, size: Size) -> list[int]:
     ]
     # By camera, and by time within a camera: evenly spread numbers then take all cameras and all parts of the drive.
     of_size.sort(key=lambda i: (drive.images[i].camera, drive.images[i].unit))
-    chosen = np.linspace(0, len(of_size) - 1, min(SAMPLED_IMAGES, len(of_size))).round().astype(int)
+    chosen = nearest_even_choice(len(of_size), SAMPLED_IMAGES).tolist()
     return [of_size[k] for k in chosen]
 
 

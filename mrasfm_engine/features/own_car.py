@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.features.static_outline import RESOLUTION, RIM_PX, StaticEdges, gradients_of, trace_outline
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points, unproject_pixels
 from mrasfm_engine.io.image_decoding import IncompleteImageError
@@ -131,7 +132,7 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
             return None
         return None if small is None else (small, _outlines(small))
 
-    sampled = np.unique(np.linspace(0, len(units) - 1, min(MAX_IMAGES, len(units))).round().astype(int))
+    sampled = nearest_even_choice(len(units), MAX_IMAGES)
     groups = [images_of[units[index]] for index in sampled.tolist()]
     with (
         closing(in_order(threads, look, chain.from_iterable(groups))) as found,

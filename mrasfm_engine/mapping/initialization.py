@@ -10,6 +10,7 @@ import pycolmap
 
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.errors import ReconstructionError
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.mapper import Mapper
@@ -258,7 +259,7 @@ def _matches_between(mapper: Mapper, pairs: Sequence[PairMatches], u: int, v: in
         rows_u.append(a)
         rows_v.append(b)
     a, b = np.concatenate(rows_u), np.concatenate(rows_v)
-    keep = np.unique(np.linspace(0, len(a) - 1, min(len(a), MAX_RELATIVE_MATCHES)).astype(np.int64))
+    keep = even_choice(len(a), MAX_RELATIVE_MATCHES)
     return a[keep], b[keep]
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pycolmap
 
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.geometry.colmap_cameras import SolverCameras
@@ -123,7 +124,7 @@ def register_from_correspondences(
     """
     if len(matched.camera) < min_inliers:
         return failed(unit, matched, 0, f"it sees {len(matched.camera)} points of the scene, {min_inliers} are needed")
-    sample = matched.select(_spread(len(matched.camera), MAX_CORRESPONDENCES))
+    sample = matched.select(even_choice(len(matched.camera), MAX_CORRESPONDENCES))
     fit = _joint_fit(mapper, matched, sample, expected)
     method, votes = "joint", list[Vote]()
     required = mapper.config.mapping.min_pnp_inlier_ratio
@@ -217,10 +218,6 @@ def correspondences_of_unit(mapper: Mapper, unit: int) -> Correspondences2D3D:
         camera=mapper.keypoints.camera[rows],
         band=mapper.keypoints.band[rows],
     )
-
-
-def _spread(count: int, limit: int) -> Ints:
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64))
 
 
 def cameras_of(mapper: Mapper) -> SolverCameras:

@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.geometry.camera_model import pack_cameras, unproject_pixels
 from mrasfm_engine.geometry.frustum import view_overlap
 from mrasfm_engine.matching.calibration_check import (
@@ -67,7 +68,7 @@ class _Comparison:
 
     def evenly(self, count: int) -> _Comparison:
         """Units all along, not more than `count`."""
-        return self._at(np.linspace(0, len(self.units) - 1, min(count, len(self.units))).round().astype(np.int64))
+        return self._at(nearest_even_choice(len(self.units), count))
 
     def _run(self) -> _Comparison | None:
         """The longest run of units below `CLEARLY_BETTER`, of which `MIN_UNITS` are below `CLEARLY_WORSE`.

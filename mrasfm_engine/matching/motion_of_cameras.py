@@ -35,6 +35,7 @@ from itertools import combinations
 import numpy as np
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.camera_model import pack_cameras
@@ -417,7 +418,7 @@ def _motions(
         if len({groups[camera] for camera in _cameras_by_themselves(drive, own)}) > 1
     )
     result, elapsed_s = list[MotionMatches](), list[float]()
-    for row in np.unique(np.linspace(0, len(several) - 1, min(len(several), MAX_MOTIONS)).astype(np.int64)).tolist():
+    for row in even_choice(len(several), MAX_MOTIONS).tolist():
         u, v = several[row]
         for pair in between[u, v]:
             a, b = (drive.images[image] for image in (pair.image_a, pair.image_b))
@@ -426,7 +427,7 @@ def _motions(
                 continue
             if a.unit > b.unit:
                 a, b, rays_a, rays_b = b, a, rays_b, rays_a
-            keep = np.linspace(0, len(rays_a) - 1, min(len(rays_a), MAX_MATCHES)).astype(np.int64)
+            keep = even_choice(len(rays_a), MAX_MATCHES)
             result.append(
                 MotionMatches(
                     motion=len(elapsed_s),

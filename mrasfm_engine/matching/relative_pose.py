@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.matching.sampson import epipolar_derivatives, most_likely_pose
 from mrasfm_engine.matching.verification import signed_parallax
@@ -123,7 +124,7 @@ class RelativePose:
         `sigma_rad` is the standard deviation of right matches. The second result is the squared length of the
         correction in the prior's standard deviations.
         """
-        keep = np.linspace(0, len(rays_a) - 1, min(len(rays_a), MAX_REFINING)).astype(np.int64)
+        keep = even_choice(len(rays_a), MAX_REFINING)
         rays_a, rays_b = rays_a[keep], rays_b[keep]
         variance, axes = np.linalg.eigh(self.covariance)
         prior_root = axes * np.sqrt(np.maximum(variance, 0.0))

@@ -9,6 +9,7 @@ import numpy as np
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.geometry.neighbours import nearest
@@ -132,8 +133,7 @@ class RelistedImages:
 
     def _scan(self) -> int:
         """The lag, by steps, at which most matches of some units fit the calibration; 0 where none do."""
-        count = min(SCANNED_UNITS, len(self._units))
-        units = self._units[np.linspace(0, len(self._units) - 1, count).round().astype(np.int64)]
+        units = self._units[nearest_even_choice(len(self._units), SCANNED_UNITS)]
         beyond = range(MAX_LAG + 1, FARTHEST_LAG + 1, LAG_STEP)
         fit: dict[int, list[int]] = {}
         for lag, a, b in self._pairs(units, [*beyond, *(-lag for lag in beyond)]):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.config import PairConfig
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE
 from mrasfm_engine.matching.image_motion import Motion
 from mrasfm_engine.matching.pair_selection import REVISIT_PATH_M, units_ahead
@@ -138,7 +139,7 @@ class ImageIndex:
             vector = _vlad(found, centres)
             steps[image] = max(float(np.abs(vector).max()), 1e-6) / np.iinfo(np.int8).max
             codes[image] = np.round(vector / steps[image])
-        sample = np.unique(np.linspace(0, count - 1, min(count, SAMPLED_VECTORS)).astype(np.int64))
+        sample = even_choice(count, SAMPLED_VECTORS)
         sampled = codes[sample] * steps[sample, None]
         energy, directions = np.linalg.eigh(sampled @ sampled.T)  # smaller than the vectors' own covariance
         keep = np.flatnonzero(energy > energy[-1] * ROUNDING)[-DIRECTIONS:]
@@ -162,7 +163,7 @@ def _vocabulary(features: Sequence[ImageFeatures]) -> Floats32:
     """Words (w, D) from descriptors that are taken evenly from the whole drive."""
     stops = np.cumsum([min(len(found.xy_px), KEYPOINTS_PER_IMAGE) for found in features])
     total = int(stops[-1])
-    sample = np.linspace(0, total - 1, min(total, TRAINING_DESCRIPTORS)).astype(np.int64)
+    sample = even_choice(total, TRAINING_DESCRIPTORS)
     image = np.searchsorted(stops, sample, side="right")
     parts = []
     for i in np.unique(image).tolist():

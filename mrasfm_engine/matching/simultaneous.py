@@ -27,6 +27,7 @@ import numpy as np
 
 from mrasfm_engine.config import BundleAdjustmentConfig, MatchConfig
 from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.even_choice import even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.matching.relative_pose import UncertainRig
@@ -211,7 +212,7 @@ def _pooled(
     result = []
     for (a, b), parts in sorted(by_cameras.items()):
         stops = np.cumsum([int(part.inliers.sum()) for part in parts])
-        keep = np.unique(np.linspace(0, stops[-1] - 1, min(int(stops[-1]), MAX_MATCHES)).astype(np.int64))
+        keep = even_choice(int(stops[-1]), MAX_MATCHES)
         rays: tuple[list[Floats], list[Floats]] = ([np.zeros((0, 3))], [np.zeros((0, 3))])
         for part, first, stop in zip(parts, [0, *stops[:-1]], stops, strict=True):
             rows = keep[slice(*np.searchsorted(keep, [first, stop]))] - first

@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 
 from mrasfm_engine.errors import CancelledError, InputError
+from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_gray, read_largest_of_16_bits, unused_bits
@@ -165,9 +166,7 @@ def _moments(drive: Drive, units: Sequence[int]) -> list[tuple[int, int]]:
 
 def _spread(items: Sequence[Item], count: int) -> list[Item]:
     """A given number of the items at most, from the first to the last."""
-    if len(items) <= count:
-        return list(items)
-    return [items[int(k)] for k in np.unique(np.linspace(0, len(items) - 1, count).round())]
+    return [items[k] for k in nearest_even_choice(len(items), count).tolist()]
 
 
 def _sampled_besides(drive: Drive, taken: set[int]) -> set[int]:

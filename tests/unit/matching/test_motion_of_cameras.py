@@ -140,14 +140,14 @@ LATE = {"radius_m": 10.0, "time_offset_ms": [0, 50, 50, 50, 50, 50], "readout_ms
 
 
 def test_cameras_that_are_not_simultaneous_are_not_turned_for_that() -> None:
-    simulated = turned([0.0, 0.0, 0.0], **LATE)  # type: ignore[arg-type]
+    simulated = turned([0.0, 0.0, 0.0], **LATE)
     found = by_motion(simulated)
     assert found.motions > 10
     np.testing.assert_array_equal(found.rig_from_cam, simulated.drive.rig_from_cam)
 
 
 def test_a_turned_camera_that_is_not_simultaneous_is_found() -> None:
-    simulated = turned([0.0, 6.0, 0.0], **LATE)  # type: ignore[arg-type]
+    simulated = turned([0.0, 6.0, 0.0], **LATE)
     assert off_deg(simulated, by_motion(simulated).rig_from_cam) < 2.0
 
 
