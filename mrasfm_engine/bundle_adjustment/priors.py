@@ -114,8 +114,7 @@ def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> fl
     Of a camera's own there is a Cauchy loss each over rotation and translation, of those that are not held, and squares
     of the rest.
     """
-    s2 = loss_scale**2
-    own = s2 * np.log1p(_squared(np.where(held, 0.0, r)) / s2).sum() + (r[held] ** 2).sum() / HELD_SHARE**2
+    own = _cauchy_loss(_squared(np.where(held, 0.0, r)), loss_scale) + (r[held] ** 2).sum() / HELD_SHARE**2
     return float(0.5 * own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
 
 
@@ -387,8 +386,13 @@ def cauchy_weights(residuals: Floats, loss_scale: float) -> Floats:
 
 def cauchy_cost(residuals: Floats, loss_scale: float) -> float:
     """Half the sum of the Cauchy loss of residuals (n, k) over sigma."""
+    return 0.5 * _cauchy_loss((residuals**2).sum(1), loss_scale)
+
+
+def _cauchy_loss(squared: Floats, loss_scale: float) -> float:
+    """Sum of the Cauchy loss of residuals over sigma with squared lengths of any shape."""
     s2 = loss_scale**2
-    return float(0.5 * s2 * np.log1p((residuals**2).sum(1) / s2).sum())
+    return float(s2 * np.log1p(squared / s2).sum())
 
 
 def add_to_units(
