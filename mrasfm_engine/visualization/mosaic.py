@@ -239,7 +239,9 @@ def _paint_squares(
         for row in range(rows[i], rows[i + 1]):
             y = y_first - row * cell
             row_u, row_v, row_z, step_u, step_v, step_z = along_row(nodes, rows, columns, i, j, row)
-            given_u, given_v, _, given_step_u, given_step_v, _ = along_row(given, rows, columns, i, j, row)
+            given_u = given_v = given_step_u = given_step_v = 0.0
+            if is_given_linear:
+                given_u, given_v, _, given_step_u, given_step_v, _ = along_row(given, rows, columns, i, j, row)
             for column in range(columns[j], columns[j + 1]):
                 x, along = x_first + column * cell, column - columns[j]
                 z = row_z + along * step_z if square == LINEAR else height_at(heights, x - first[0], y - first[1])
