@@ -53,13 +53,18 @@ def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
                 code="bad-scene-name",
             )
         if name in result:
-            raise InputError(
-                f"two scenes are called {name!r}: {result[name]} and {folder}",
-                remedy="Give each scene once, or names of their own: NAME=FOLDER.",
-                code="duplicate-scene",
-            )
+            raise duplicate_scene(name, result[name], folder)
         result[name] = folder
     return result
+
+
+def duplicate_scene(name: str, folder: Path, other: Path) -> InputError:
+    """Refusal of two scenes with one name."""
+    return InputError(
+        f"two scenes are called {name!r}: {folder} and {other}",
+        remedy="Give each scene once, or names of their own: NAME=FOLDER.",
+        code="duplicate-scene",
+    )
 
 
 def components_of(folder: Path, name: str) -> dict[str, Path]:

@@ -66,11 +66,9 @@ def _named(words: list[str]) -> dict[str, Path]:
         given, path = split_name(word)
         name = path.resolve().name if given is None else given
         if name in result:
-            raise InputError(
-                f"two scenes are called {name!r}: {result[name]} and {path}",
-                remedy="Give each scene once, or names of their own: NAME=FOLDER.",
-                code="duplicate-scene",
-            )
+            from mrasfm_engine.aggregation.load import duplicate_scene
+
+            raise duplicate_scene(name, result[name], path)
         result[name] = path
     return result
 
