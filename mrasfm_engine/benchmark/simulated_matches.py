@@ -112,7 +112,7 @@ def _views(route: LongRoute) -> Iterator[_View]:
 def revisits(views: list[_View], route: LongRoute, per_unit: int, rng: np.random.Generator) -> tuple[Ints, Ints]:
     """Image pairs (n, 2) of units that came back, and (m, 2) of places that only look alike.
 
-    As in `correspondence.revisits`, a unit has its `per_unit` best pairs; of a pair of one camera, the units' other
+    As in `matching.retrieval`, a unit has its `per_unit` best pairs; of a pair of one camera, the units' other
     cameras are paired as well.
     """
     cameras, units = len(route.cameras), len(route.world_from_rig)
@@ -203,18 +203,21 @@ def _near_epipolar_lines(
     rotation, translation_m = b_from_a[:3, :3].copy(), b_from_a[:3, 3].copy()
     essential = se3.skew(translation_m) @ rotation
     max_sine = math.sin(config.matching.max_error_px / max(a.focal_px, b.focal_px))
-    found: tuple[Ints, Ints] = _confused(
+    found: tuple[Ints, Ints] = _match_wrongly(
         rows, count, a.rays, b.rays, essential, rotation, translation_m, max_sine, true_partner, rng.random(len(rows))
     )
     return found
 
 
 @njit(cache=True, nogil=True)
-def _confused(
+def _match_wrongly(
     rows: Any, count: int, rays_a: Any, rays_b: Any, essential: Any, rotation: Any, translation_m: Any,
     max_sine: float, true_partner: Any, chance: Any,
 ) -> Any:  # fmt: skip
-    """`epipolar_errors` and `in_front_of_both` for one ray against many: as arrays they take ten times as long."""
+    """Match rows, one after the other, with any ray that is near the epipolar line, in front and not taken yet.
+
+    These are `epipolar_errors` and `in_front_of_both` for one ray against many: as arrays they take ten times as long.
+    """
     taken = np.zeros(len(rays_b), np.bool_)
     fitting = np.empty(len(rays_b), np.int64)
     own, other = np.empty(count, np.int64), np.empty(count, np.int64)

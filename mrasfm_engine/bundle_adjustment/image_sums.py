@@ -44,7 +44,10 @@ def _inner_sums(inner: int) -> tuple[int, int]:
 
 @uncounted(forceinline=True)
 def as_tuples(jx: Any, d: Any, res: Any) -> tuple[tuple[tuple[float, ...], ...], tuple[float, ...], tuple[float, ...]]:
-    """Rows of N, X - t_u and the residual of an observation."""
+    """Rows of N, X - t_u and the residual of an observation.
+
+    Numbers, unlike elements of arrays, are not read again after each sum that is written: it may be the same array.
+    """
     rows = (jx[0, 0], jx[0, 1], jx[0, 2]), (jx[1, 0], jx[1, 1], jx[1, 2])
     return rows, (d[0], d[1], d[2]), (res[0], res[1])
 
