@@ -67,3 +67,14 @@ def test_winding_street_turns_and_straight_one_does_not() -> None:
 def test_nonsense_is_refused() -> None:
     with pytest.raises(InputError, match="cannot simulate"):
         simulate_observations(units=0, rng=np.random.default_rng(0))
+
+
+def test_a_car_that_drives_round_a_circle_is_back_with_its_heading() -> None:
+    radius_m = 5.0
+    poses = poses_along(np.linspace(0.0, 2.0 * np.pi * radius_m, 9), spacing_m=0.1, radius_m=radius_m)
+    np.testing.assert_allclose(poses[-1, :2, 3], poses[0, :2, 3], atol=0.02)
+    np.testing.assert_allclose(poses[-1, :2, 0], poses[0, :2, 0], atol=0.03)
+    across_m = np.linalg.norm(poses[4, :2, 3] - poses[0, :2, 3])
+    assert across_m == pytest.approx(2.0 * radius_m, abs=0.02)
+    left = poses[0, :2, 1]  # the circle's middle lies to the left
+    assert left @ (poses[4, :2, 3] - poses[0, :2, 3]) > 1.9 * radius_m
