@@ -18,6 +18,7 @@ from mrasfm_engine.matching.relisted_images import MAX_LAG, _common_rotation
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import make_drive, random_descriptors
+from tests.helpers.slow import slow
 
 UNITS, POINTS, FOCAL_PX, WIDTH, HEIGHT = 12, 4000, 700.0, 960, 540
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
@@ -121,7 +122,7 @@ def test_images_that_are_listed_as_they_were_taken_pass(cameras: int) -> None:
     street(cameras=cameras).check()
 
 
-@pytest.mark.parametrize("lag", [1, -1, 2, MAX_LAG])
+@pytest.mark.parametrize("lag", [-1, MAX_LAG, *slow(1, 2)])
 def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag: int) -> None:
     with pytest.raises(InputError) as caught:
         street(late=1, lag=lag).check()
@@ -131,7 +132,7 @@ def test_a_camera_that_is_late_by_whole_frames_is_refused_with_their_number(lag:
     assert frames in caught.value.remedy
 
 
-@pytest.mark.parametrize("lag", [MAX_LAG + 1, 13, -20])
+@pytest.mark.parametrize("lag", [MAX_LAG + 1, *slow(13, -20)])
 def test_a_camera_that_is_late_by_so_much_that_it_sees_other_things_is_refused_with_the_number(lag: int) -> None:
     with pytest.raises(InputError) as caught:
         street(units=40, late=1, lag=lag, speed_m=0.8, turn_deg=0.4).check()
@@ -156,7 +157,7 @@ def test_cameras_that_match_nowhere_are_not_late() -> None:
         (range(4, 8), "from {4} us to {7} us"),
     ],
 )
-@pytest.mark.parametrize("lag", [1, -1])
+@pytest.mark.parametrize("lag", [1, *slow(-1)])
 def test_a_camera_that_is_late_from_somewhere_on_is_refused_with_the_time(
     late_units: range, span: str, lag: int
 ) -> None:
