@@ -206,16 +206,9 @@ def turned_about_every_axis(rig_from_cam: np.ndarray, *, by_deg: float, seed: in
     return rig_from_cam
 
 
-@pytest.mark.parametrize(
-    "drive",  # cameras, units, metres, degrees by which cameras are turned, seed
-    [(5, 5, 6.0, 1.0, 1), (4, 5, 6.0, 2.0, 0), (4, 5, 2.0, 1.0, 1), *slow((5, 8, 0.7, 2.0, 0), (6, 5, 2.0, 2.0, 1))],
-)
-def test_a_receiver_is_right_beside_a_rig_whose_few_units_take_any_size(
-    drive: tuple[int, int, float, float, int],
-) -> None:
-    """Cameras that hardly share a view, turned by a degree or two, on their first metres from a standstill."""
-    cameras, units, way_m, by_deg, seed = drive
-    simulated = make_simulated_drive(
+def drive_of_few_units(cameras: int, units: int, way_m: float, by_deg: float, seed: int) -> SimulatedDrive:
+    """Cameras that hardly share a view, turned about every axis, on their first metres from a standstill."""
+    return make_simulated_drive(
         units=units,
         cameras=cameras,
         points=600,
@@ -224,6 +217,17 @@ def test_a_receiver_is_right_beside_a_rig_whose_few_units_take_any_size(
         given=partial(turned_about_every_axis, by_deg=by_deg, seed=seed),
         seed=seed,
     )
+
+
+@pytest.mark.parametrize(
+    "drive",  # cameras, units, metres, degrees by which cameras are turned, seed
+    [(5, 5, 6.0, 1.0, 1), (4, 5, 6.0, 2.0, 0), (4, 5, 2.0, 1.0, 1), *slow((5, 8, 0.7, 2.0, 0), (6, 5, 2.0, 2.0, 1))],
+)
+def test_a_receiver_is_right_beside_a_rig_whose_few_units_take_any_size(
+    drive: tuple[int, int, float, float, int],
+) -> None:
+    """Cameras that hardly share a view, turned by a degree or two, on their first metres from a standstill."""
+    simulated, way_m = drive_of_few_units(*drive), drive[2]
     known = {"gnss": received(simulated, 0.05 * way_m), "antenna_in_rig_m": ARM_M}
     mapper = mapped(simulated, AbsolutePriors(**known))
     result = refine(mapper, AbsolutePriors(**known))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -12,22 +10,9 @@ from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
-from tests.helpers.simulated_drive import SimulatedDrive, make_model, make_simulated_drive, with_true_poses
+from tests.helpers.simulated_drive import SimulatedDrive, make_model, with_true_poses
 from tests.helpers.slow import slow
-from tests.unit.mapping.test_absolute_priors import mapped, turned_about_every_axis
-
-
-def drive_of_few_units(cameras: int, units: int, way_m: float, by_deg: float, seed: int) -> SimulatedDrive:
-    """Cameras that hardly share a view, turned about every axis, on their first metres from a standstill."""
-    return make_simulated_drive(
-        units=units,
-        cameras=cameras,
-        points=600,
-        straight=True,
-        travelled_m=way_m * (np.arange(units) / (units - 1)) ** 2,
-        given=partial(turned_about_every_axis, by_deg=by_deg, seed=seed),
-        seed=seed,
-    )
+from tests.unit.mapping.test_absolute_priors import drive_of_few_units, mapped
 
 
 def log_scale(simulated: SimulatedDrive, mapper: Mapper) -> float:
