@@ -17,7 +17,7 @@ import pycolmap
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.subprocess_run import run_in_subprocess
-from mrasfm_engine.types import Floats, Ints, StageProgress
+from mrasfm_engine.types import Floats, StageProgress
 
 BINARY_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
 TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
@@ -59,12 +59,11 @@ class ImageRead:
 
 @dataclass(frozen=True, kw_only=True)
 class ModelRead:
-    """A model as COLMAP has read it: rigs, cameras and images by id, and points (p, 3) by rising id (p,)."""
+    """A model as COLMAP has read it: rigs, cameras and images by id, and points (p, 3) by rising id."""
 
     rigs: Mapping[int, RigRead]
     cameras: Mapping[int, CameraRead]
     images: Mapping[int, ImageRead]
-    point_ids: Ints
     points: Floats
     observations: int
     is_valid: bool
@@ -148,9 +147,7 @@ def _read_text(folder: Path) -> ModelRead:
 
 
 def _read_of(model: pycolmap.Reconstruction) -> ModelRead:
-    ids = np.array(list(model.points3D), dtype=np.int64)
     points = np.reshape([point.xyz for point in model.points3D.values()], (-1, 3))
-    order = np.argsort(ids)
     posed = set(model.reg_image_ids())
     return ModelRead(
         rigs={number: _rig(rig) for number, rig in model.rigs.items()},
@@ -159,8 +156,7 @@ def _read_of(model: pycolmap.Reconstruction) -> ModelRead:
             for number, camera in model.cameras.items()
         },
         images={number: _image(image, number in posed) for number, image in model.images.items()},
-        point_ids=ids[order],
-        points=points[order],
+        points=points[np.argsort(list(model.points3D))],
         observations=model.compute_num_observations(),
         is_valid=model.is_valid(),
     )
