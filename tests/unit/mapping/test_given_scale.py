@@ -11,7 +11,7 @@ from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.geometry.camera_model import project_points
-from mrasfm_engine.mapping import given_scale, refinement
+from mrasfm_engine.mapping import adjustment_rounds, given_scale
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapper import Mapper
@@ -101,7 +101,7 @@ def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypat
         both.append(error)
         sigmas.append(result.given_scale.sigma_scale)
     held = [refined(one, free=False)[0] for one in drives]
-    monkeypatch.setattr(refinement, "scale_of_given_rotations", lambda *_, **__: None)
+    monkeypatch.setattr(adjustment_rounds, "scale_of_given_rotations", lambda *_, **__: None)
     free = [refined(one)[0] for one in drives]
     assert 1e-4 < rms(both) < min(rms(held), rms(free))
     assert 0.5 < rms((np.array(both) / sigmas).tolist()) < 2.0
@@ -112,7 +112,7 @@ def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share
     simulated = drive(1)
     mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(UNITS))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(refinement, "certainty_of", lambda *_: None)
+        patch.setattr(adjustment_rounds, "certainty_of", lambda *_: None)
         unweighed = refined(simulated)[1]
     assert unweighed.sigma_factor == 1.0
     result = refine(mapper)
@@ -151,7 +151,7 @@ def test_rotations_that_images_contradict_say_nothing_of_the_scale(
         asked.append(1.0 - prior.log_scale / prior.log_scale_of(mapper.state) if is_asked else 0.0)
         return prior
 
-    monkeypatch.setattr(refinement, "scale_of_given_rotations", hear)
+    monkeypatch.setattr(adjustment_rounds, "scale_of_given_rotations", hear)
     error, _ = refined(drive(1, lens_px=0.0, turned_px=off_px))
     assert abs(error) < 0.02
     assert len(asked) == 1
@@ -172,7 +172,7 @@ def test_a_drive_tells_how_well_rotations_are_known(off_px: float, least: float,
 def test_given_rotations_are_asked_once_images_have_found_the_scale(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before that, derivatives are those of another scene: the scale would be pulled where nobody wants it."""
     done = []
-    adjust = refinement._adjust
+    adjust = adjustment_rounds.adjust
 
     def adjusted(*values: Any, **arguments: Any) -> None:
         done.append("adjusted")
@@ -182,8 +182,8 @@ def test_given_rotations_are_asked_once_images_have_found_the_scale(monkeypatch:
         done.append("heard")
         return given_scale.scale_of_given_rotations(mapper, **arguments)
 
-    monkeypatch.setattr(refinement, "_adjust", adjusted)
-    monkeypatch.setattr(refinement, "scale_of_given_rotations", heard)
+    monkeypatch.setattr(adjustment_rounds, "adjust", adjusted)
+    monkeypatch.setattr(adjustment_rounds, "scale_of_given_rotations", heard)
     refined(drive(1))
     assert done[:3] == ["adjusted", "heard", "adjusted"]
     assert done.count("heard") == 1
