@@ -267,7 +267,7 @@ class TimePrior:
     def cost(self, state: State) -> float:
         """See `Term`."""
         r2, s2 = (state.camera_time_offset_s / self.sigma_s) ** 2, self.loss_scale**2
-        own = np.where(self.held, r2 / HELD_SHARE**2, s2 * np.log1p(r2 / s2)).sum()
+        own = np.where(self.held, r2 / HELD_SHARE**2, s2 * relative_cauchy_losses(r2, self.loss_scale)).sum()
         return float(0.5 * own + 0.5 * (self._gauge() @ state.camera_time_offset_s) ** 2)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
@@ -391,8 +391,16 @@ def cauchy_cost(residuals: Floats, loss_scale: float) -> float:
 
 def _cauchy_loss(squared: Floats, loss_scale: float) -> float:
     """Sum of the Cauchy loss of residuals over sigma with squared lengths of any shape."""
-    s2 = loss_scale**2
-    return float(s2 * np.log1p(squared / s2).sum())
+    return float(loss_scale**2 * relative_cauchy_losses(squared, loss_scale).sum())
+
+
+def relative_cauchy_losses(squared: Floats, loss_scale: float = 1.0) -> Floats:
+    """Cauchy losses, over the square of their scale, of residuals with squared lengths of any shape.
+
+    These are over sigma, or over sigma and the loss's scale, which then is 1.
+    """
+    result: Floats = np.log1p(squared / loss_scale**2)
+    return result
 
 
 def add_to_units(

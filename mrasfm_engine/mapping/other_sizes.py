@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances
-from mrasfm_engine.bundle_adjustment.priors import Term
+from mrasfm_engine.bundle_adjustment.priors import Term, relative_cauchy_losses
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.calibration import scale_scene, sigma_scale_of_images
 from mrasfm_engine.mapping.mapper import Mapper
@@ -277,7 +277,8 @@ def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> Cost
         mapper.triangulator.errors_px(mapper.state, seen, mapper.state.points_m, of_keypoint[seen]),
         mapper.triangulator.max_error_px,
     )
-    costs = 0.5 * options.loss_scale**2 * np.log1p((errors_px / (options.loss_scale * options.sigma_px)) ** 2)
+    loss_scale_px = options.loss_scale * options.sigma_px
+    costs = 0.5 * options.loss_scale**2 * relative_cauchy_losses((errors_px / loss_scale_px) ** 2)
     return Cost(
         of_terms=sum(term.cost(mapper.state) for term in terms),
         of_tracks=np.bincount(of_keypoint[rows], weights=costs, minlength=len(mapper.tracks)).astype(np.float64),
