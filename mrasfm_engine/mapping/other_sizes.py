@@ -145,7 +145,7 @@ def scenes_of_sizes(
             if any(_is_beyond(factor, end) for end in ends):
                 continue
             _begin_with(mapper, start, factor, dropped)
-            cost = _adjusted_cost(mapper, dropped, adjust, terms, options, sizes_m)
+            cost = _least_cost(mapper, dropped, lambda: _adjusted_cost(mapper, adjust, terms, options), sizes_m)
             if _is_known(size_m(mapper), sizes_m) or any(known.is_clearly_below(cost) for known in costs):
                 ends.append(factor)
             sizes_m.append(size_m(mapper))
@@ -182,7 +182,12 @@ def cost_as_found(mapper: Mapper, options: SolverOptions) -> Cost:
     Terms are left out, in favour of what was found: those of its cameras may have had other weights when it was
     adjusted, or none.
     """
-    return scenes_of_sizes(mapper, [1.0], lambda terms: None, list, options).costs[0]
+    kept, dropped = parts_of(mapper), np.flatnonzero(mapper.rejected)
+    try:
+        _begin_with(mapper, kept, 1.0, dropped)
+        return _least_cost(mapper, dropped, lambda: _cost(mapper, (), options))
+    finally:
+        _restore(mapper, kept)
 
 
 def is_another_size(size: float, other: float, *, near: float = 0.0) -> bool:
@@ -234,35 +239,33 @@ def _is_beyond(factor: float, nearer: float) -> bool:
     return bool(np.log(factor) / np.log(nearer) > 1.0) if nearer != 1.0 else False
 
 
-def _adjusted_cost(
-    mapper: Mapper,
-    dropped: Ints,
-    adjust: Adjust,
-    terms: Terms,
-    options: SolverOptions,
-    sizes_m: Sequence[float],
+def _least_cost(
+    mapper: Mapper, dropped: Ints, cost_of_scene: Callable[[], Cost], sizes_m: Sequence[float] = ()
 ) -> Cost:
-    """Cost of the scene, adjusted with what fits it until that changes no more, or it has come to a size (n,) that is
-    known.
+    """Cost of the scene with what fits it, which it takes up until that changes no more, or it has come to a size (n,)
+    that is known.
     """
-    least, best = None, parts_of(mapper)
-    for _ in range(MOST_ROUNDS):
-        if least is not None:
-            best = copy.deepcopy(parts_of(mapper))
-            mapper.complete()
-            mapper.drop(dropped)
-        known = terms()
-        adjust(known)
-        cost = _cost(mapper, known, options)
-        gain = np.inf if least is None else least.total - cost.total
-        if least is not None and gain <= 0.0:
-            _restore(mapper, best)
-            break
-        least = cost
+    least, gain = cost_of_scene(), np.inf
+    for _ in range(MOST_ROUNDS - 1):
         if gain < SMALL or _is_known(size_m(mapper), sizes_m):
             break
-    assert least is not None
+        best = copy.deepcopy(parts_of(mapper))
+        mapper.complete()
+        mapper.drop(dropped)
+        cost = cost_of_scene()
+        gain = least.total - cost.total
+        if gain <= 0.0:
+            _restore(mapper, best)
+        else:
+            least = cost
     return least
+
+
+def _adjusted_cost(mapper: Mapper, adjust: Adjust, terms: Terms, options: SolverOptions) -> Cost:
+    """Cost of the scene once it is adjusted."""
+    known = terms()
+    adjust(known)
+    return _cost(mapper, known, options)
 
 
 def _cost(mapper: Mapper, terms: Sequence[Term], options: SolverOptions) -> Cost:
