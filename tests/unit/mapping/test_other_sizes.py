@@ -19,6 +19,7 @@ from mrasfm_engine.mapping.other_sizes import (
     UNSURE,
     Cost,
     SizedScenes,
+    cost_as_found,
     scenes_of_other_sizes,
     scenes_of_sizes,
     size_m,
@@ -100,6 +101,24 @@ def test_tracks_that_were_dropped_for_what_they_show_come_back_at_no_size() -> N
     scenes.take(scenes.best, mapper)
     assert mapper.rejected[tracks].all()
     assert not mapper.is_inlier[np.isin(mapper.tracks.of_keypoint, tracks)].any()
+
+
+def test_the_cost_as_found_is_that_of_all_observations_that_fit_without_tracks_that_were_dropped() -> None:
+    mapper = true_model(cameras=2)
+    tracks = np.flatnonzero(mapper.triangulated)[::3]
+    mapper.drop(tracks)
+    complete = cost_as_found(mapper, OPTIONS)
+    mapper.is_inlier[np.flatnonzero(mapper.is_inlier)[::5]] = False
+    mapper.filter(mapper.config.mapping.filter_error_px)
+    state, inlier, rejected = mapper.state, mapper.is_inlier.copy(), mapper.rejected.copy()
+    found = cost_as_found(mapper, OPTIONS)
+    assert found.of_terms == 0.0
+    assert found.total == pytest.approx(complete.total, rel=0.01)
+    assert not found.of_tracks[tracks].any()
+    assert (found.of_tracks > 0.0).sum() > 0.5 * len(mapper.tracks)
+    assert mapper.state is state
+    np.testing.assert_array_equal(mapper.is_inlier, inlier)
+    np.testing.assert_array_equal(mapper.rejected, rejected)
 
 
 @pytest.mark.parametrize("sigma_scale", [0.5 * UNSURE, np.inf])
