@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import json
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, TypeVar
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.api.aggregations import AggregationRequest
 from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
 from schemas.api.exports import ExportFileResource, ExportRequest, ExportResource
-from schemas.api.jobs import JobResource, ReconstructionSettings
+from schemas.api.jobs import JobKind, JobResource, JobState, ReconstructionSettings
 from schemas.api.maps import MapFileResource, MapResource, MapVersionResource
 from schemas.api.resource import Page
 from schemas.api.scenes import SceneFileResource, SceneResource
@@ -198,9 +198,11 @@ class Client:
         """One job."""
         return self._get(f"/v1/jobs/{_part(job_id)}", JobResource)
 
-    def jobs(self, *, drive_id: str | None = None) -> Iterator[JobResource]:
-        """All jobs of the project, newest first; of one drive alone where that is given."""
-        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id)
+    def jobs(
+        self, *, drive_id: str | None = None, states: Iterable[JobState] = (), kinds: Iterable[JobKind] = ()
+    ) -> Iterator[JobResource]:
+        """All jobs of the project, newest first; of one drive, some states or kinds alone where these are given."""
+        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id, state=[*states], kind=[*kinds])
 
     def poll_job(self, job_id: str, etag: str | None) -> tuple[JobResource | None, str | None, float]:
         """A job, if it has changed since it had this ETag.
@@ -392,12 +394,13 @@ class Client:
         """Delete something. Where an answer was lost and the request tried again, that is told as 404."""
         self._transport.request("DELETE", path)
 
-    def _pages(self, path: str, model: type[Page[Item]], **where: str | None) -> Iterator[Item]:
+    def _pages(self, path: str, model: type[Page[Item]], **where: str | Sequence[str] | None) -> Iterator[Item]:
         """All items of a list, page after page as they are asked for."""
         given = {name: value for name, value in where.items() if value is not None}
         cursor: str | None = None
         while True:
-            query = urlencode({**given, "limit": str(PAGE), **({} if cursor is None else {"cursor": cursor})})
+            place = {"limit": str(PAGE), **({} if cursor is None else {"cursor": cursor})}
+            query = urlencode({**given, **place}, doseq=True)
             page = _parsed(self._transport.request("GET", f"{path}?{query}"), model)
             yield from page.items
             cursor = page.next

@@ -6,6 +6,7 @@ import argparse
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any
 
 from schemas.command_line import output_folder
@@ -36,6 +37,10 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     parser = _command(subparsers, "list", "list what the project has", _list)
     parser.add_argument("what", choices=LISTS, help="kind of what is listed, newest first")
     parser.add_argument("--limit", type=int, default=50, metavar="N", help="how many (default: 50)")
+    parser.add_argument("--state", action="append", dest="states", metavar="STATE", help="only jobs in this state, "
+                        "such as FAILED; may be repeated")  # fmt: skip
+    parser.add_argument("--kind", action="append", dest="kinds", metavar="KIND", help="only jobs of this kind, such as "
+                        "RECONSTRUCTION; may be repeated")  # fmt: skip
     parser = _command(subparsers, "show", "show a drive, job, scene, map, export or webhook", _show)
     parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map also MAP/VERSION")
     parser = _command(subparsers, "delete", "delete a drive, scene, map, export or webhook", _delete)
@@ -95,8 +100,25 @@ def _command(
 
 
 def _list(conversation: Conversation, summary: Summary) -> int:
-    items: Iterable[BaseModel] = getattr(conversation.client, conversation.arguments.what)()
-    return _print(conversation, summary, items, limit=conversation.arguments.limit)
+    arguments = conversation.arguments
+    items: Iterable[BaseModel] = getattr(conversation.client, arguments.what)(**_only(arguments))
+    return _print(conversation, summary, items, limit=arguments.limit)
+
+
+def _only(arguments: argparse.Namespace) -> dict[str, Any]:
+    """States and kinds of the jobs that are listed."""
+    from schemas.api.jobs import JobKind, JobState
+    from service.client import ClientError
+
+    wanted: tuple[tuple[str, type[StrEnum]], ...] = (("states", JobState), ("kinds", JobKind))
+    given = {name: (getattr(arguments, name), values) for name, values in wanted if getattr(arguments, name)}
+    if given and arguments.what != "jobs":
+        raise ClientError(f"{arguments.what} have no state or kind. Give --state and --kind with `list jobs`.")
+    for name, (words, values) in given.items():
+        for word in words:
+            if word not in list(values):
+                raise ClientError(f"--{name[:-1]} is {word!r}. Give one of {', '.join(values)}.")
+    return {name: words for name, (words, _) in given.items()}
 
 
 def _deliveries(conversation: Conversation, summary: Summary) -> int:

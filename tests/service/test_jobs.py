@@ -170,6 +170,36 @@ def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
     assert len(client.get("/v1/jobs").json()["items"]) == 6
 
 
+def test_jobs_are_listed_by_state_and_kind(api: Api) -> None:
+    client = api.client()
+    drive_id = client.committed()
+    waits, runs, silent, broken = (
+        client.reconstruct(drive_id, **{"Idempotency-Key": key})["id"] for key in ("waits", "runs", "silent", "broken")
+    )
+    client.claim(runs)
+    client.claim(silent)
+    with api.database.write() as session:
+        session.get_one(Job, silent).heartbeat_us = now_us() - 600_000_000
+    fail(client, client.claim(broken))
+
+    def listed(*where: tuple[str, str]) -> list[str]:
+        return [shown["id"] for shown in client.get("/v1/jobs", params=[*where]).json()["items"]]
+
+    reconstructions = ("kind", "RECONSTRUCTION")
+    assert listed(("state", "FAILED")) == [broken]
+    assert listed(("state", "RUNNING"), reconstructions) == [runs], "what is shown as STALLED is not listed as RUNNING"
+    assert listed(("state", "STALLED")) == [silent]
+    assert listed(("state", "STALLED"), ("state", "RUNNING"), reconstructions) == [silent, runs]
+    assert listed(("state", "QUEUED"), ("state", "FAILED"), reconstructions) == [broken, waits]
+    assert listed(reconstructions) == [broken, silent, runs, waits]
+    assert len(listed(("kind", "PREFLIGHT"))) == 1
+    assert listed(("kind", "EXPORT")) == []
+    page = client.get("/v1/jobs", params={"kind": "RECONSTRUCTION", "limit": 3}).json()
+    assert listed(reconstructions, ("cursor", page["next"])) == [waits]
+    assert client.get("/v1/jobs", params={"state": "failed"}).status_code == 422
+    assert client.get("/v1/jobs", params=[("kind", "EXPORT")] * 6).status_code == 422
+
+
 def test_a_page_of_jobs_ends_where_their_members_are_many(api: Api, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_views, "CHILDREN_OF_PAGE", 10)
     client = api.client()

@@ -16,7 +16,8 @@ from tests.helpers.tiny_drive import png, tiny_drive
     [
         ("/v1/jobs?limits=5", "limits", "did you mean 'limit'?"),
         ("/v1/scenes?driveid=drv_1&limit=5", "driveid", "did you mean 'drive_id'?"),
-        ("/v1/jobs?sate=failed", "sate", "which takes cursor, drive_id, limit"),
+        ("/v1/jobs?sate=failed", "sate", "did you mean 'state'?"),
+        ("/v1/jobs?xyz=1", "xyz", "which takes cursor, drive_id, kind, limit, state"),
         ("/v1/status?verbose", "verbose", "which takes none"),
         ("/v1/jobs?%1b[31m=1", "\x1b[31m", "'query.\\x1b[31m' is no parameter"),
     ],

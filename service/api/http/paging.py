@@ -8,7 +8,7 @@ import json
 from collections.abc import Sequence
 from typing import Any, TypeVar
 
-from sqlalchemy import Row, Select, select, tuple_
+from sqlalchemy import ColumnElement, Row, Select, select, tuple_
 from sqlalchemy.orm import InstrumentedAttribute, Session, load_only
 
 from schemas.drive import MAX_PATH_CHARACTERS
@@ -68,6 +68,7 @@ def newest(
     cursor: str | None,
     limit: int,
     places_only: bool = False,
+    conditions: Sequence[ColumnElement[bool]] = (),
     **where: Any,
 ) -> tuple[list[Paged], str | None]:
     """Read a page of a project's rows, the newest first, of those that have the values of `where` that are not None.
@@ -76,8 +77,10 @@ def newest(
     ----------
     places_only
         Whether nothing of the rows is loaded but their places in the list.
+    conditions
+        Further ones, all of which the rows meet.
     """
-    statement = select(table).where(table.project_id == project_id)
+    statement = select(table).where(table.project_id == project_id, *conditions)
     if places_only:
         statement = statement.options(load_only(table.id, table.created_us))
     statement = statement.filter_by(**{name: value for name, value in where.items() if value is not None})

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import accumulate
 
-from sqlalchemy import select
+from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobAttempt as AttemptResource
@@ -41,6 +41,17 @@ def shown_state(job: Job, stalled_us: int) -> ShownState:
     return ShownState(job.state)
 
 
+def _is_shown_as(states: Collection[ShownState], stalled_us: int) -> ColumnElement[bool]:
+    """The condition that `shown_state` is one of these."""
+    is_stalled = func.coalesce(Job.heartbeat_us, 0) < stalled_us
+    result = Job.state.in_([JobState(state) for state in states if state is not ShownState.STALLED])
+    if ShownState.STALLED in states:
+        return result | ((Job.state == JobState.RUNNING) & is_stalled)
+    if ShownState.RUNNING in states:
+        return result & ((Job.state != JobState.RUNNING) | ~is_stalled)
+    return result
+
+
 def etag_of(job: Job, shown: JobResource) -> str:
     """Changes with everything that a reader can see; also with children, which go on after their parent has ended."""
     children = "".join(child.model_dump_json() for child in (*shown.members, *shown.submaps))
@@ -50,6 +61,11 @@ def etag_of(job: Job, shown: JobResource) -> str:
 
 def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list[JobResource]:
     """Jobs as the API shows them."""
+    return _views_at(session, found, stalled_before_us(session, settings))
+
+
+def _views_at(session: Session, found: Sequence[Job], stalled_us: int) -> list[JobResource]:
+    """Jobs as the API shows them, STALLED where they run and were last heard of before a time."""
     attempts: dict[str, list[JobAttempt]] = {}
     ids = [job.id for job in found]
     for attempt in session.scalars(select(JobAttempt).where(JobAttempt.job_id.in_(ids)).order_by(JobAttempt.fence)):
@@ -58,7 +74,6 @@ def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list
     members = jobs.members_of(session, trees) if trees else {}
     planned = [job.id for job in found if job.kind == JobKind.RECONSTRUCTION and job.children_percent]
     submaps = jobs.submaps_of(session, planned) if planned else {}
-    stalled_us = stalled_before_us(session, settings)
     return [
         _shown(job, attempts.get(job.id, ()), members.get(job.id, ()), submaps.get(job.id, ()), stalled_us)
         for job in found
@@ -66,19 +81,40 @@ def views_of(session: Session, found: Sequence[Job], settings: Settings) -> list
 
 
 def page_of_jobs(
-    session: Session, project_id: str, settings: Settings, *, cursor: str | None, limit: int, drive_id: str | None
+    session: Session,
+    project_id: str,
+    settings: Settings,
+    *,
+    cursor: str | None,
+    limit: int,
+    drive_id: str | None,
+    states: Collection[ShownState] = (),
+    kinds: Collection[JobKind] = (),
 ) -> Page[JobResource]:
-    """A page of a project's jobs, the newest first.
+    """A page of a project's jobs, the newest first; of some states and kinds alone where any are given.
 
     Each may show a thousand children: the page ends before the limit where they would be too many, and `next` goes on
     with the first job that was left out. Of those that are left out nothing but their places in the list is loaded.
     """
-    found, following = newest(session, Job, project_id, cursor=cursor, limit=limit, places_only=True, drive_id=drive_id)
+    stalled_us = stalled_before_us(session, settings)
+    conditions = [_is_shown_as(states, stalled_us)] if states else []
+    if kinds:
+        conditions.append(Job.kind.in_(kinds))
+    found, following = newest(
+        session,
+        Job,
+        project_id,
+        cursor=cursor,
+        limit=limit,
+        places_only=True,
+        conditions=conditions,
+        drive_id=drive_id,
+    )
     shown = found[: count_shown_together(session, [job.id for job in found])]
     if len(shown) < len(found):
         following = newest_after(shown[-1])
     session.scalars(select(Job).where(Job.id.in_([job.id for job in shown]))).all()  # completes those that are there
-    return Page[JobResource](items=views_of(session, shown, settings), next=following)
+    return Page[JobResource](items=_views_at(session, shown, stalled_us), next=following)
 
 
 def count_shown_together(session: Session, job_ids: Sequence[str]) -> int:

@@ -12,6 +12,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind, JobResource
+from schemas.api.jobs import JobState as ShownState
 from schemas.api.resource import Id, Page
 from service.api.context import Context
 from service.api.credentials import secret_of
@@ -65,10 +66,25 @@ def list_jobs(
     limit: Limit = 50,
     cursor: Cursor = None,
     drive_id: Annotated[Id | None, Query(description="only of this drive")] = None,
+    state: Annotated[
+        list[ShownState] | None, Query(max_length=len(ShownState), description="only in this state; may be repeated")
+    ] = None,
+    kind: Annotated[
+        list[JobKind] | None, Query(max_length=len(JobKind), description="only of this kind; may be repeated")
+    ] = None,
 ) -> Response:
     """Jobs of the project, newest first. A page ends before `limit` where its jobs have thousands of members."""
     with context.database.read() as session:
-        page = page_of_jobs(session, caller.project_id, context.settings, cursor=cursor, limit=limit, drive_id=drive_id)
+        page = page_of_jobs(
+            session,
+            caller.project_id,
+            context.settings,
+            cursor=cursor,
+            limit=limit,
+            drive_id=drive_id,
+            states=state or (),
+            kinds=kind or (),
+        )
     body = page.model_dump_json().encode()
     etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
     headers = {"ETag": etag, "Cache-Control": "no-cache"}

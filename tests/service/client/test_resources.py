@@ -181,6 +181,9 @@ def test_commands(
     job = client.reconstruct(client.committed())
     assert run(client, capsys, "cancel", job["id"])[1]["job_state"] == "CANCELLED"
     assert run(client, capsys, "wait", job["id"])[0] == 3
+    only = ("--kind", "RECONSTRUCTION", "--state", "CANCELLED", "--state", "FAILED")
+    assert [item["id"] for item in run(client, capsys, "list", "jobs", *only)[1]["items"]] == [job["id"]]
+    assert run(client, capsys, "list", "jobs", *only[:2], "--state", "RUNNING")[1]["items"] == []
     assert run(client, capsys, "retry", job["id"])[1]["job_id"] != job["id"]
     code, told = run(client, capsys, "webhook", "https://example.org/", "--event", "job.failed")
     assert told["items"][0]["secret"].startswith("whsec_")
@@ -190,6 +193,8 @@ def test_commands(
     assert run(client, capsys, "show", webhook_id)[1]["items"][0]["events"] == ["job.failed"]
     assert run(client, capsys, "delete", webhook_id)[0] == 0
     for words in (
+        ("list", "scenes", "--state", "FAILED"),
+        ("list", "jobs", "--state", "failed"),
         ("show", "abc"),
         ("show", "scn_0/1"),
         ("delete", job["id"]),
