@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sqlalchemy import Engine, ExceptionContext, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
@@ -19,14 +19,22 @@ from sqlalchemy.orm import Session, sessionmaker
 from service.database.tables import now_us
 from service.settings import Settings
 
+if TYPE_CHECKING:
+    from alembic.config import Config
+
 Result = TypeVar("Result")
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 # PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
 _TRY_AGAIN = frozenset({"40001", "40P01"})
 _READ_ONLY = "25006"
+LOCK_TIMEOUT = "55P03"
 MAX_ATTEMPTS = 5  # of one transaction
 WAIT_S = 0.05  # at most, before the second; twice as long before each later one
+# A migration waits that long for a table: whoever wants it meanwhile waits behind the migration.
+TABLE_LOCK_S = 5.0
+PAUSE_S = 10.0  # of a migration that got no table
+MAX_MIGRATION_ATTEMPTS = 40
 # An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
 _ENGINE: dict[str, Any] = {"pool_size": 10, "max_overflow": 30, "hide_parameters": True}
 
@@ -181,8 +189,10 @@ def _write_ahead(connection: sqlite3.Connection, timeout_s: float) -> None:
 
 
 def migrate(settings: Settings) -> None:
-    """Bring the database to the newest schema; safe to run by several processes at once and again."""
-    from alembic import command
+    """Bring the database to the newest schema; safe to run by several processes at once and again.
+
+    A table that another transaction uses for long is asked for again, for ten minutes.
+    """
     from alembic.config import Config
 
     database = Database.from_settings(settings)
@@ -190,16 +200,31 @@ def migrate(settings: Settings) -> None:
         event.listen(database.engine, "connect", _ignore_references)
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS).replace("%", "%%"))
-    options = {"mrasfm_begin": "IMMEDIATE"}  # the second process waits here until the first is done
     try:
-        with database.engine.connect().execution_options(**options) as connection, connection.begin():
-            if connection.dialect.name == "postgresql":
-                connection.execute(text("SET LOCAL statement_timeout TO 0"))  # large tables take their time
-                connection.execute(text("SELECT pg_advisory_xact_lock(5240017)"))
-            config.attributes["connection"] = connection
-            command.upgrade(config, "head")
+        for attempts_left in reversed(range(MAX_MIGRATION_ATTEMPTS)):
+            try:
+                _upgrade(database, config)
+                break
+            except OperationalError as error:
+                if getattr(error.orig, "sqlstate", None) != LOCK_TIMEOUT or not attempts_left:
+                    raise
+            time.sleep(PAUSE_S)
     finally:
         database.close()
+
+
+def _upgrade(database: Database, config: Config) -> None:
+    """Bring the database to the newest schema in one transaction."""
+    from alembic import command
+
+    options = {"mrasfm_begin": "IMMEDIATE"}  # the second process waits here until the first is done
+    with database.engine.connect().execution_options(**options) as connection, connection.begin():
+        if connection.dialect.name == "postgresql":
+            connection.execute(text("SET LOCAL statement_timeout TO 0"))  # large tables take their time
+            connection.execute(text("SELECT pg_advisory_xact_lock(5240017)"))
+            connection.execute(text(f"SET LOCAL lock_timeout TO {round(1000 * TABLE_LOCK_S)}"))
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
 
 
 def _ignore_references(connection: sqlite3.Connection, record: Any) -> None:

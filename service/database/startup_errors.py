@@ -10,6 +10,7 @@ from alembic.util.exc import CommandError
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import SQLAlchemyError
 
+from service.database.connections import LOCK_TIMEOUT
 from service.settings import Settings
 
 
@@ -39,4 +40,6 @@ def unusable_is_told(settings: Settings) -> Iterator[None]:
         remedy = "Check MRASFM_DATABASE_URL, and that its server runs."
         if settings.database_url is None:
             remedy = "Check that its disk has room and that the file belongs to you."
+        elif getattr(getattr(error, "orig", None), "sqlstate", None) == LOCK_TIMEOUT:
+            remedy = "Another transaction has used a table for minutes: end it (pg_stat_activity), and migrate again."
         raise UnusableDatabaseError(f"the database {database} cannot be used: {reason}. {remedy}") from error

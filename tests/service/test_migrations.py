@@ -9,13 +9,16 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+import pytest
 from alembic import command
 from alembic.autogenerate import compare_metadata
 from alembic.config import Config
 from alembic.runtime.migration import MigrationContext
 from sqlalchemy import inspect, text
 
+from service.database import connections
 from service.database.connections import MIGRATIONS, Database, is_current, migrate
+from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
 from service.database.tables import (
     Base,
     ConsoleSession,
@@ -30,7 +33,7 @@ from service.database.tables import (
 from service.domain import webhooks
 from service.domain.drives import Stored, stored_of
 from service.settings import Settings
-from tests.helpers.live_api import REPOSITORY, free_port
+from tests.helpers.live_api import REPOSITORY, free_port, wait_until
 
 
 def differences(database: Database) -> list[object]:
@@ -63,6 +66,51 @@ def test_migrating_again_and_at_once_changes_nothing(database_settings: Settings
     database = Database.from_settings(database_settings)
     assert differences(database) == []
     database.close()
+
+
+def test_a_migration_that_waits_for_a_table_lets_others_have_it(
+    postgres_database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Behind a migration that waits for a long transaction, every later reader of the table would wait as well."""
+    monkeypatch.setattr(connections, "TABLE_LOCK_S", 0.3)
+    monkeypatch.setattr(connections, "PAUSE_S", 0.2)
+    settings = Settings(database_url=postgres_database)
+    database = Database.from_settings(settings)
+    _upgrade(database, "0013")
+    waiting = threading.Thread(target=migrate, args=(settings,))
+    with database.engine.connect() as user, user.begin():
+        user.execute(text("SELECT count(*) FROM jobs"))
+        waiting.start()
+        wait_until(lambda: _waits_for_a_lock(database), "the migration waits for the table")
+        with database.engine.connect() as reader, reader.begin():
+            reader.execute(text("SET LOCAL statement_timeout TO 5000"))
+            reader.execute(text("SELECT count(*) FROM jobs"))
+        assert not is_current(database)
+    waiting.join(60.0)
+    assert is_current(database)
+    assert differences(database) == []
+    database.close()
+
+
+def test_a_migration_that_gets_no_table_says_what_to_do(
+    postgres_database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "TABLE_LOCK_S", 0.1)
+    monkeypatch.setattr(connections, "PAUSE_S", 0.0)
+    monkeypatch.setattr(connections, "MAX_MIGRATION_ATTEMPTS", 2)
+    settings = Settings(database_url=postgres_database)
+    database = Database.from_settings(settings)
+    _upgrade(database, "0013")
+    with database.engine.connect() as user, user.begin():
+        user.execute(text("SELECT count(*) FROM jobs"))
+        with pytest.raises(UnusableDatabaseError, match="pg_stat_activity"), unusable_is_told(settings):
+            migrate(settings)
+    database.close()
+
+
+def _waits_for_a_lock(database: Database) -> bool:
+    with database.engine.connect() as connection:
+        return bool(connection.scalar(text("SELECT count(*) FROM pg_locks WHERE NOT granted AND relation IS NOT NULL")))
 
 
 def _migrated_with(settings: Settings, version: str, records: Sequence[str]) -> Database:
