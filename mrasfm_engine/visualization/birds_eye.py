@@ -18,6 +18,7 @@ import numpy as np
 
 from mrasfm_engine.export.picture_files import LargeFile
 from mrasfm_engine.io.images import mask_of_png, read_image_rgb, read_mask
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.scene.semantics import class_codes, usable_pixels
 from mrasfm_engine.types import Bools, Bytes, CountProgress, Floats
@@ -98,8 +99,9 @@ def birds_eye(
         if scratch is not None:
             finishing = pool.submit(finish_road, scene, plan, road, scratch, optional.error)
         agreement = measure_agreement(plots or [mosaic], plan.trajectory_m)
+        gains = camera_gains(mosaic)
         before, after = pool.map(
-            lambda which: _picture(scene, mosaic, which, agreement, plan.plan_from_world), (GIVEN, REFINED)
+            lambda which: _picture(scene, mosaic, which, gains, agreement, plan.plan_from_world), (GIVEN, REFINED)
         )
         drawn = RoadPicture() if finishing is None else finishing.result()
     report = _report(scene, mosaic, agreement)
@@ -155,7 +157,12 @@ def read_view(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
 
 
 def _picture(
-    scene: Scene, mosaic: Mosaic, which: int, agreement: tuple[Agreement, Agreement] | None, plan_from_world: Floats
+    scene: Scene,
+    mosaic: Mosaic,
+    which: int,
+    gains: Floats,
+    agreement: tuple[Agreement, Agreement] | None,
+    plan_from_world: Floats,
 ) -> Framed:
     title = f"{scene.drive.manifest.name}: the road from above, "
     title += "calibration as given" if which == GIVEN else "calibration as refined"
@@ -170,24 +177,42 @@ def _picture(
     arrows = [("drive", (1.0, 0.0))]
     if scene.georeference is not None:
         arrows.append(("north", (float(plan_from_world[0, 1]), float(plan_from_world[1, 1]))))
-    return framed(chequerboard(mosaic, which), [title, note], cell_m=mosaic.grid.cell_m, arrows=arrows)
+    return framed(chequerboard(mosaic, which, gains), [title, note], cell_m=mosaic.grid.cell_m, arrows=arrows)
 
 
-def chequerboard(mosaic: Mosaic, which: int) -> Bytes:
+def chequerboard(mosaic: Mosaic, which: int, gains: Floats) -> Bytes:
     """The picture (h, w, 3) under one calibration, alternately by the best and by the second best camera, cut to what
-    is seen."""
+    is seen.
+
+    Parameters
+    ----------
+    gains
+        Factors (cameras,) on the colours, see `camera_gains`.
+    """
+    rows, columns = mosaic.seen()
+    result = np.empty((rows.stop - rows.start, columns.stop - columns.start, 3), np.uint8)
+    shown_as = np.minimum(gains[:, None] * np.arange(256.0) + 0.5, 255).astype(np.uint8)
     tile = round(max(TILE_M, 16 * mosaic.grid.cell_m) / mosaic.grid.cell_m)
-    odd = ((np.arange(mosaic.grid.rows) // tile)[:, None] + (np.arange(mosaic.grid.columns) // tile)[None]) % 2 == 1
-    second = odd & (mosaic.owner[1] > 0) & (mosaic.score[1] >= MIN_SECOND_SHARE * mosaic.score[0])
-    result = mosaic.color[which, 0].copy()
-    cv2.copyTo(mosaic.color[which, 1], second.astype(np.uint8), result)
-    owner = np.where(second, mosaic.owner[1], mosaic.owner[0])
-    for camera, gain in enumerate(camera_gains(mosaic), 1):
-        table = np.minimum(gain * np.arange(256.0) + 0.5, 255).astype(np.uint8)
-        cv2.copyTo(cv2.LUT(result, table), (owner == camera).astype(np.uint8), result)
-    result[mosaic.owner[0] == 0] = EMPTY
-    cut: Bytes = result[mosaic.seen()]
-    return cut
+    place = rows.start, columns.start
+    _lay_tiles(mosaic.owner, mosaic.score, mosaic.color[which], shown_as, EMPTY, tile, *place, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _lay_tiles(
+    owner: Any, score: Any, color: Any, shown_as: Any, empty: Any, tile: int, top: int, left: int, result: Any
+) -> None:
+    """Colour the cells (h, w, 3) of a mosaic from a row and column on; `shown_as` (cameras, 256) is by camera."""
+    for i in range(result.shape[0]):
+        row = top + i
+        for j in range(result.shape[1]):
+            column = left + j
+            layer = 0
+            if (row // tile + column // tile) % 2 == 1 and owner[1, row, column] > 0:
+                layer = int(score[1, row, column] >= MIN_SECOND_SHARE * score[0, row, column])
+            camera = owner[layer, row, column]
+            for k in range(3):
+                result[i, j, k] = empty[k] if camera == 0 else shown_as[camera - 1, color[layer, row, column, k]]
 
 
 def _world_from_pixel(mosaic: Mosaic, plan: Plan, top_px: int) -> Floats:

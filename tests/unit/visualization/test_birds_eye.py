@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.visualization.agreement import Agreement, why_not_better
-from mrasfm_engine.visualization.birds_eye import birds_eye
+from mrasfm_engine.visualization.birds_eye import EMPTY, MIN_SECOND_SHARE, birds_eye, chequerboard
 from mrasfm_engine.visualization.drawing import framed
+from mrasfm_engine.visualization.mosaic import Grid, Mosaic
+from mrasfm_engine.visualization.views import REFINED
 from tests.helpers.export_example import make_scene
 
 
@@ -29,6 +31,28 @@ def test_the_frame_keeps_the_picture_and_draws_a_scale_of_the_right_length() -> 
     below = out.picture[out.top_px + 400 :]
     longest = max((row.min(axis=1) < 60).sum() for row in below[:, :500])
     assert 198 <= longest <= 206  # 5 m: the longest round length within a quarter of the width
+
+
+def test_tiles_alternate_between_the_two_best_cameras_and_are_equally_bright() -> None:
+    grid = Grid(left_m=0.0, top_m=0.0, cell_m=0.5, rows=40, columns=50)  # tiles of 16 cells
+    owner = np.zeros((2, 40, 50), np.uint8)
+    owner[0, 3:, :45], owner[1, 3:, :45] = 1, 2
+    owner[1, :, 33:] = 0  # only one camera sees the ground there
+    score = np.zeros((2, 40, 50), np.float32)
+    score[0], score[1] = 40.0, 20.0
+    score[1, 32:] = 0.9 * MIN_SECOND_SHARE * 40.0  # too coarse beside the best
+    color = np.zeros((2, 2, 40, 50, 3), np.uint8)
+    color[REFINED, 0], color[REFINED, 1] = (60, 80, 100), (30, 40, 200)
+    mosaic = Mosaic(grid=grid, owner=owner, score=score, color=color, images_used=2)
+    owner[0, 20, 20] = owner[1, 20, 20] = 0
+    shown = chequerboard(mosaic, REFINED, np.array([1.0, 1.5]))
+    first, second = (60, 80, 100), (45, 60, 255)
+    assert shown.shape == (37, 45, 3), "cut to what is seen"
+    tiles = {(0, 0): first, (0, 16): second, (13, 0): second, (13, 16): first, (13, 33): first, (29, 16): first}
+    for (row, column), seen in tiles.items():
+        assert (shown[row : row + 3, column : column + 4] == seen).all(), (row, column)
+    assert tuple(shown[17, 20]) == EMPTY
+    assert len(np.unique(shown.reshape(-1, 3), axis=0)) == 3
 
 
 def agreement_of(correlations: np.ndarray) -> Agreement:
