@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.scene import Scene, observed_colors
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Floats
 from mrasfm_engine.visualization.mosaic import Mosaic
 from mrasfm_engine.visualization.views import REFINED
 
@@ -35,7 +36,7 @@ def exposure_gains(scene: Scene) -> Floats:
     colors = observed_colors(scene.features, image, scene.observation_keypoint)[order]
     point = scene.observation_point[order]
     images, start = np.unique(image[order], return_index=True)
-    bounds = [*start.tolist(), len(image)]
+    bounds = np.append(start, len(image))
     count = np.maximum(np.bincount(point), 1)
     for k in range(3):  # colour by colour: of all at once, logarithms and their means take most of the memory
         exposure = _exposures(LOG_COLOR[colors[:, k]], point, count, bounds)
@@ -43,14 +44,20 @@ def exposure_gains(scene: Scene) -> Floats:
     return gains
 
 
-def _exposures(log_color: Floats, point: Ints, count: Ints, bounds: list[int]) -> Floats:
+@njit(cache=True, nogil=True)
+def _exposures(log_color: Any, point: Any, count: Any, bounds: Any) -> Any:
     """Exposures (i,) of images whose observations (n,), of points with so many (p,), lie between bounds (i + 1,)."""
-    exposure: Floats = np.zeros(len(bounds) - 1)
+    images = len(bounds) - 1
+    exposure, mean = np.zeros(images), np.zeros(len(count))
     for _ in range(ROUNDS):
-        mean = np.bincount(point, log_color - np.repeat(exposure, np.diff(bounds))) / count
-        for i, (lo, hi) in enumerate(pairwise(bounds)):
-            change = np.median(log_color[lo:hi] - mean[point[lo:hi]])
-            exposure[i] = change * (hi - lo) / (hi - lo + SHRINKAGE)
+        mean[:] = 0.0
+        for i in range(images):
+            for n in range(bounds[i], bounds[i + 1]):
+                mean[point[n]] += log_color[n] - exposure[i]
+        mean /= count
+        for i in range(images):
+            lo, hi = bounds[i], bounds[i + 1]
+            exposure[i] = np.median(log_color[lo:hi] - mean[point[lo:hi]]) * (hi - lo) / (hi - lo + SHRINKAGE)
         exposure -= exposure.mean()
     return exposure
 
