@@ -20,7 +20,7 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import make_drive, random_descriptors
 from tests.helpers.slow import slow
 
-UNITS, POINTS, FOCAL_PX, WIDTH, HEIGHT = 12, 4000, 700.0, 960, 540
+UNITS, POINTS, FOCAL_PX, WIDTH, HEIGHT = 12, 2000, 700.0, 960, 540
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 CONFIG = MatchConfig()
 
