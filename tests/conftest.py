@@ -31,6 +31,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# Three test processes share two cores. OpenBLAS would start a thread for each core in all of them, whose small matrices
+# then wait for one another: most of the time of some tests. Those of xdist load it after this line.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 # Kernels are compiled once for all test processes, while these run the tests that need none.
 _KERNEL_LOCK = "MRASFM_TEST_KERNEL_LOCK"
 NICENESS = 5  # of test processes beside which kernels are compiled, to their end: only root can take it back

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,7 @@ class Messages:
     kept: list[tuple[str, int, Any]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.store = get_typestore(Stores.ROS1_NOETIC if self.is_ros1 else Stores.ROS2_HUMBLE)
-        if TF not in self.store.types:
-            self.store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+        self.store = _store(is_ros1=self.is_ros1)
 
     def new(self, kind: str, **values: Any) -> Any:
         return self.store.types[kind](**values)
@@ -137,6 +136,15 @@ class Messages:
             if topic not in connections:
                 connections[topic] = bag.add_connection(topic, kind, typestore=self.store)
             bag.write(connections[topic], (time_us + late_us) * 1000, bytes(serialize(message, kind)))
+
+
+@cache
+def _store(*, is_ros1: bool) -> Typestore:
+    """All types of a version of ROS; rosbags compiles them, which takes longer than to write a short bag."""
+    store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+    if TF not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
+    return store
 
 
 def messages_of_drive(drive: Drive, *, is_ros1: bool, start_us: int = 0, compressed: bool = False) -> Messages:
