@@ -61,8 +61,14 @@ def world(make_world: Callable[..., World]) -> World:
 
 @pytest.fixture
 def own_drive(small_drive: Path, tmp_path: Path) -> Path:
-    """A copy of that drive to damage."""
+    """A copy of the small drive to damage."""
     return Path(shutil.copytree(small_drive, tmp_path / "drive"))
+
+
+@pytest.fixture
+def own_brief_drive(brief_drive: Path, tmp_path: Path) -> Path:
+    """A copy of the brief drive to damage."""
+    return Path(shutil.copytree(brief_drive, tmp_path / "drive"))
 
 
 @pytest.fixture

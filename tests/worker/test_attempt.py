@@ -69,17 +69,17 @@ def leftovers(scratch: Path) -> list[str]:
 
 
 def test_reconstruction_and_another_that_reuses_its_stages(
-    small_drive: Path, scratch: Path, settings: Settings, tmp_path: Path
+    brief_drive: Path, scratch: Path, settings: Settings, tmp_path: Path
 ) -> None:
     seen: list[ProgressNote] = []
     meter = meter_of()
     outcome = attempt(
-        small_drive, scratch, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
+        brief_drive, scratch, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
     )
     assert isinstance(outcome, Succeeded)
     report = outcome.report
     assert report == json.loads((outcome.out / "report.json").read_text(encoding="utf-8"))
-    assert report["summary"]["registered_units"] == 6
+    assert report["summary"]["registered_units"] == 4
     assert report["settings"]["features"]["max_keypoints"] == 1000
     assert report["settings"]["seed"] == 5
     assert report["settings"]["threads"] == 1
@@ -100,7 +100,7 @@ def test_reconstruction_and_another_that_reuses_its_stages(
     AttemptFolder(scratch).finished_stages.rename(AttemptFolder(second).finished_stages)
     meter = meter_of()
     again = attempt(
-        small_drive, second, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
+        brief_drive, second, settings, lambda: seen.append(meter.at(0.0)), meter=meter, max_keypoints=1000, seed=5
     )
     assert isinstance(again, Succeeded)
     reused = {stage["stage"]: stage["reused"] for stage in again.report["stages"]}
@@ -130,16 +130,16 @@ def test_bad_input_has_the_words_of_the_command(
 
 
 @pytest.mark.parametrize("work", [Work.RECONSTRUCTION, Work.PREFLIGHT])
-def test_broken_manifest(own_drive: Path, scratch: Path, settings: Settings, work: Work) -> None:
-    (own_drive / "drive.json").write_text('{"name": NaN}', encoding="utf-8")
-    outcome = attempt(own_drive, scratch, settings, work=work)
+def test_broken_manifest(own_brief_drive: Path, scratch: Path, settings: Settings, work: Work) -> None:
+    (own_brief_drive / "drive.json").write_text('{"name": NaN}', encoding="utf-8")
+    outcome = attempt(own_brief_drive, scratch, settings, work=work)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable, outcome.stage) == ("bad-document", False, "")
     assert outcome.what == "drive manifest drive.json: holds NaN, which is not a JSON number"
 
 
-def test_unknown_setting(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    outcome = attempt(small_drive, scratch, settings, gravity=9.81)
+def test_unknown_setting(brief_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt(brief_drive, scratch, settings, gravity=9.81)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable) == ("bad-settings", False)
     assert "gravity" in outcome.what
@@ -211,8 +211,8 @@ def test_preflight_finds_an_inverted_calibration(own_drive: Path, scratch: Path,
     assert [finding["code"] for finding in outcome.report["findings"]] == ["calibration-inverted"]
 
 
-def test_killed_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGKILL)
+def test_killed_child(brief_drive: Path, scratch: Path, settings: Settings) -> None:
+    outcome = attempt_with_a_signal(brief_drive, scratch, settings, signal.SIGKILL)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable, outcome.blame) == ("engine-killed", True, 0.0)
     assert outcome.stage in STAGES
@@ -232,11 +232,11 @@ def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> 
     assert not [path for path in files if path.startswith("/")], "they are shown to users"
 
 
-def test_cancel(small_drive: Path, scratch: Path, settings: Settings) -> None:
+def test_cancel(brief_drive: Path, scratch: Path, settings: Settings) -> None:
     """By the token alone: signals would come after 20 s."""
     meter = meter_of()
     with pytest.raises(StopRequest) as stopped:
-        attempt(small_drive, scratch, settings, stop_once_it_works(meter, StopReason.CANCEL), meter=meter)
+        attempt(brief_drive, scratch, settings, stop_once_it_works(meter, StopReason.CANCEL), meter=meter)
     assert stopped.value.reason is StopReason.CANCEL
     assert meter.stage in STAGES
     scene = AttemptFolder(scratch).out

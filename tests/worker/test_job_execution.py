@@ -129,14 +129,14 @@ def test_preflight_of_a_sound_drive(world: World, brief_drive: Path) -> None:
     assert all(finding["severity"] == "warning" for finding in drive.findings)
 
 
-def test_unsound_drive(world: World, own_drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_unsound_drive(world: World, own_brief_drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Its check rejects it; a reconstruction asked for meanwhile fails at once with the same words as the command."""
-    images = sorted((own_drive / "images").rglob("*.jpg"))
+    images = sorted((own_brief_drive / "images").rglob("*.jpg"))
     for image in images[:2]:
         image.write_bytes(image.read_bytes()[:-2000])
-    assert main(["reconstruct", str(own_drive), "--out", str(tmp_path / "scene")]) == 2
+    assert main(["reconstruct", str(own_brief_drive), "--out", str(tmp_path / "scene")]) == 2
     words = capfd.readouterr().err
-    drive_id, check_id = world.add_unchecked_drive(own_drive)
+    drive_id, check_id = world.add_unchecked_drive(own_brief_drive)
     job_id = world.ask(drive_id, wake=False)
     job = run(world, job_id)
     assert (job.state, job.attempt) == ("FAILED", 1)

@@ -259,9 +259,9 @@ def supervisor(scratch: Path, *arguments: object) -> list[str]:
     return [sys.executable, "-c", SUPERVISOR, str(scratch), str(first), str(root), *map(str, rest)]
 
 
-def test_child_dies_with_its_supervisor(small_drive: Path, scratch: Path) -> None:
+def test_child_dies_with_its_supervisor(brief_drive: Path, scratch: Path) -> None:
     """A real child, and the supervisor has no time to say good-bye."""
-    process = subprocess.Popen(supervisor(scratch, "drive", small_drive))
+    process = subprocess.Popen(supervisor(scratch, "drive", brief_drive))
     request = AttemptFolder(scratch).request
     try:
         wait_until(lambda: children_with(request) != [], "the child's start")

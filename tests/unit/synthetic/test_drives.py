@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -163,7 +164,7 @@ def test_same_seed_same_files_other_seed_others(tmp_path: Path) -> None:
         assert a != c
 
 
-def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
+def test_nothing_is_overwritten_without_force(drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "drive"
     out.mkdir()
     (out / "precious.txt").write_text("x")
@@ -172,8 +173,10 @@ def test_nothing_is_overwritten_without_force(tmp_path: Path) -> None:
         render_drives(options, out)
     with pytest.raises(InputError, match=r"precious.txt is no file of a rendered drive"):
         render_drives(options, out, force=True)
+    shutil.copytree(drive, out, dirs_exist_ok=True)
+    with pytest.raises(InputError, match="not an empty folder"):
+        render_drives(options, out)
     (out / "precious.txt").unlink()
-    render_drives(replace(options, masks=True), out)
     assert (out / "masks").is_dir()
     render_drives(options, out, force=True)
     assert not (out / "masks").exists()
