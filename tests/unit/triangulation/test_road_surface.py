@@ -185,7 +185,7 @@ def test_patches_of_an_earlier_fit_move_with_their_units() -> None:
 
 
 def test_the_cost_grows_with_the_length() -> None:
-    """Twice the road: at most 2.3 times the time, by the calmest of five pairs that run one after the other."""
+    """Twice the road: at most 2.3 times the time, by the first calm one of five pairs that run one after the other."""
 
     def seconds(length_m: float) -> float:
         rng, count = np.random.default_rng(0), int(40 * length_m)
@@ -199,7 +199,7 @@ def test_the_cost_grows_with_the_length() -> None:
         return time.process_time() - begin
 
     seconds(50.0)
-    assert 0 < min(seconds(600.0) / seconds(300.0) for _ in range(5)) <= 2.3
+    assert any(0 < seconds(600.0) / seconds(300.0) <= 2.3 for _ in range(5))
 
 
 def test_slanted_walls_that_masks_call_road_are_off_it() -> None:
