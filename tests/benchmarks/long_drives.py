@@ -1,7 +1,8 @@
 """Lines 41 and 42: a rendered drive of 3,600 images, by the command and by the service's workers.
 
 Line 41: memory and time of the command on its first quarter and on all of it. Line 42: two workers beside one, and two
-of which one is killed again and again.
+of which one is killed again and again. What two processes can gain on the machine at all, a plain extraction of
+keypoints tells.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import psutil
 
@@ -43,6 +46,7 @@ MOST_MEMORY_GB, MOST_TIMES_MEMORY, MOST_TIMES_A_UNIT = 3.0, 1.4, 1.15
 MOST_TIME_OF_TWO = 0.6
 KILLED_EVERY_S, KILLS = 120.0, 5
 SAME_M, SAME_DEG = 0.001, 0.005
+EXTRACTED, EXTRACTIONS = 10, 3  # pictures by each of two processes, and how often
 
 
 def memory_of_long_drives(data: Path, work: Path) -> Iterator[Figure]:
@@ -86,12 +90,42 @@ def on_several_workers(data: Path, work: Path) -> Iterator[Figure]:
         yield from _of_scene("42", title, scenes[workers], drive, UNITS)
     title = f"{UNITS} units, time of two workers beside one"
     yield Figure(line="42", what=title, value=seconds[2] / seconds[1], most=MOST_TIME_OF_TWO)
+    yield Figure(line="42", what="of keypoints, two processes beside one: what the machine has", value=_time_of_two())
     run = _Service(work / "killed workers", 2)
     scene, killed_s = run.reconstruct(drive, kills=KILLS)
     title = f"{UNITS} units, a worker killed every {KILLED_EVERY_S:.0f} s"
     yield Figure(line="42", what=title, value=killed_s, unit="s")
     yield from _of_scene("42", title, scene, drive, UNITS)
     yield from _of_kills(title, run, scene, scenes[2])
+
+
+def _time_of_two() -> float:
+    """Time of two processes at once that extract keypoints, beside that of one that does the work of both.
+
+    Half is what cores of their own with memory of their own would give.
+    """
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        list(pool.map(_extract, [1, 1]))  # both have begun
+        of_one, of_two = [], []
+        for _ in range(EXTRACTIONS):
+            of_one.append(_seconds_of(pool, [2 * EXTRACTED]))
+            of_two.append(_seconds_of(pool, [EXTRACTED, EXTRACTED]))
+    return float(np.median(of_two) / np.median(of_one))
+
+
+def _seconds_of(pool: Executor, images: list[int]) -> float:
+    begin_s = time.perf_counter()
+    list(pool.map(_extract, images))
+    return time.perf_counter() - begin_s
+
+
+def _extract(images: int) -> None:
+    """Extract the keypoints of a picture of noise so often, in one thread."""
+    cv2.setNumThreads(1)
+    noise = np.random.default_rng(SEED).integers(0, 256, (720, 1280), dtype=np.uint8)
+    picture, extractor = cv2.GaussianBlur(noise, (0, 0), 2.0), cv2.SIFT.create(2048)
+    for _ in range(images):
+        extractor.detectAndCompute(picture, None)
 
 
 def _of_scene(line: str, title: str, scene: Path, drive: Path, units: int) -> Iterator[Figure]:
