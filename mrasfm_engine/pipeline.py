@@ -12,6 +12,7 @@ from mrasfm_engine import stages
 from mrasfm_engine.compilation import watched_compilation
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, StorageError
+from mrasfm_engine.export.earlier_scene import require_same_drive
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import require_free, scratch_folder
 from mrasfm_engine.export.scene import write_scene
@@ -32,6 +33,7 @@ def reconstruct(
     cancel: Callable[[], bool] = lambda: False,
     is_new: bool = False,
     content_sha256: Mapping[str, str] | None = None,
+    force: bool = False,
 ) -> dict[str, Any]:
     """Reconstruct a drive and write the scene into the folder `out`.
 
@@ -51,6 +53,8 @@ def reconstruct(
     content_sha256
         SHA-256 of the drive's files by name, where the caller knows them: finished stages are found again by the
         contents of their input. Else the files are read for it.
+    force
+        Whether the scene may replace that of another drive in `out`.
 
     Returns
     -------
@@ -71,6 +75,8 @@ def reconstruct(
     require_free(out, result="scene")
     drive = read_drive(drive_folder, is_new=is_new)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
+    if not force:
+        require_same_drive(out, drive, lambda: run.contents)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
     with watched_compilation() as compiled:

@@ -32,6 +32,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
     parser.add_argument("--out", type=output_folder, required=True, metavar="OUT", help="folder for the scene")
     parser.add_argument("--no-gnss", action="store_true", help="ignore GNSS everywhere")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings (TOML), see mrasfm describe")
+    parser.add_argument("--force", action="store_true", help="replace the scene of another drive in OUT")
     parser.add_argument("--json", action="store_true", help="print report.json instead of a summary")
     parser.set_defaults(run=run)
 
@@ -49,7 +50,15 @@ def run(arguments: argparse.Namespace) -> int:
         watched_compilation(lambda: console.print("compiling for this machine: one to two minutes, once")),
         stage_progress(console) as progress,
     ):
-        report = reconstruct(arguments.drive, arguments.out, config, progress=progress, cancel=cancelled, is_new=True)
+        report = reconstruct(
+            arguments.drive,
+            arguments.out,
+            config,
+            progress=progress,
+            cancel=cancelled,
+            is_new=True,
+            force=arguments.force,
+        )
     if arguments.json:
         print_report(arguments.out)
     else:

@@ -378,6 +378,7 @@ _shtab_mrasfm_reconstruct_options=(
   "--out[folder for the scene]:OUT:"
   "--no-gnss[ignore GNSS everywhere]"
   "--config[settings (TOML), see mrasfm describe]:FILE:"
+  "--force[replace the scene of another drive in OUT]"
   "--json[print report.json instead of a summary]"
   ":folder with drive.json:"
 )
