@@ -17,11 +17,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
-from mrasfm_engine.errors import CancelledError, MrasfmError
+from mrasfm_engine.errors import CancelledError, MrasfmError, TerminatedError
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141  # as of a program that a broken pipe ends
+EXIT_TERMINATED = 143  # as of a program that SIGTERM ends
 GROUP = "mrasfm.commands"
 INDEX = Path(__file__).with_name("command_index.json")  # what each subcommand does, by its name
 DESCRIPTION = "Multi-camera drives to metric maps."
@@ -103,7 +104,7 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_UNREAD
     except CancelledError as error:
         print(f"mrasfm: {error}", file=sys.stderr)
-        return EXIT_INTERRUPTED
+        return EXIT_TERMINATED if isinstance(error, TerminatedError) else EXIT_INTERRUPTED
     except MrasfmError as error:
         print(f"mrasfm: error: {_without_control(str(error))}", file=sys.stderr)
         return EXIT_BAD_INPUT

@@ -49,6 +49,10 @@ class CancelledError(MrasfmError):
         super().__init__("the run was cancelled", remedy="Run it again: finished stages are reused.")
 
 
+class TerminatedError(CancelledError):
+    """SIGTERM asked to stop."""
+
+
 class StorageError(MrasfmError):
     """The disk is full or cannot be written."""
 

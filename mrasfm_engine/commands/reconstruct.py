@@ -17,6 +17,7 @@ from rich.console import Console
 
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
+from mrasfm_engine.errors import CancelledError, TerminatedError
 from schemas.artifacts import REPORT_FILE, component_folder
 from schemas.command_line import output_folder
 
@@ -73,20 +74,35 @@ def print_report(out: Path) -> None:
 
 @contextmanager
 def cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
-    """Ctrl-C asks the run to stop where it leaves nothing half-written; a second one stops at once."""
+    """Ctrl-C or SIGTERM asks the run to stop where it leaves nothing half-written; a second one stops at once.
+
+    Enter this after the engine is imported: COLMAP's library then installs a handler of SIGTERM that prints its stack.
+
+    Raises
+    ------
+    TerminatedError
+        Where SIGTERM, and not Ctrl-C, ended the run.
+    """
     asked = threading.Event()
+    received: list[int] = []
 
     def handle(number: int, frame: object) -> None:
+        received.append(number)
         if asked.is_set():
             raise KeyboardInterrupt
         asked.set()
         console.print("stopping; finished stages are kept")
 
-    before = signal.signal(signal.SIGINT, handle)
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield asked.is_set
+    except (CancelledError, KeyboardInterrupt) as error:
+        if received and received[-1] == signal.SIGTERM:
+            raise TerminatedError from error
+        raise
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _say(report: dict[str, Any], out: Path) -> None:

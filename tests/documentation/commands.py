@@ -21,6 +21,7 @@ PREAMBLE = """<!-- Made from the argument parsers by make docs: change the parse
 | 0 | done |
 | 2 | the input or the drive is at fault; the message names the file, the field and the remedy |
 | 130 | interrupted |
+| 143 | stopped by SIGTERM |
 
 A few commands have further codes; they are listed with the command. An interrupted reconstruction goes on from its last
 finished stage when the same command runs again.

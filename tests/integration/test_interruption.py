@@ -1,4 +1,4 @@
-"""Ctrl-C and a full disk leave nothing half-written, and the next run goes on from there."""
+"""Ctrl-C, SIGTERM and a full disk leave nothing half-written, and the next run goes on from there."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED
+from mrasfm_engine.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_TERMINATED
 from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, leftovers, mrasfm_process, read_report
 
 Run = Callable[..., CommandResult]
@@ -23,14 +23,21 @@ def _wait_for(path: Path, seconds: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-def test_interrupted_run_resumes(variant: Variant, mrasfm: Run) -> None:
+@pytest.mark.parametrize(
+    ("number", "code"),
+    [(signal.SIGINT, EXIT_INTERRUPTED), (signal.SIGTERM, EXIT_TERMINATED)],
+    ids=["SIGINT", "SIGTERM"],
+)
+def test_interrupted_run_resumes(variant: Variant, mrasfm: Run, number: int, code: int) -> None:
     variant.keep(cameras=["front", "left"], units=5).save()
     process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     _wait_for(variant.scene / ".stages" / "features.npz")
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == EXIT_INTERRUPTED
+    assert process.returncode == code
+    assert "stopping; finished stages are kept" in errors
     assert "Traceback" not in errors
+    assert "Aborted" not in errors  # as COLMAP's handler of SIGTERM says
     assert "cancelled" in errors
     assert {path.name for path in variant.scene.iterdir()} == {".stages"}
     assert leftovers(variant.scene.parent) == []
