@@ -41,6 +41,7 @@ def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool
         Whether the action makes sense before the service has started for the first time.
     """
     from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
+    from service.storage.data_folder import DataFolderError, require_data_folder
 
     settings = settings_of(arguments)
     if not may_begin and not holds_state(settings):
@@ -51,9 +52,11 @@ def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool
         )
         return EXIT_CANNOT_RUN
     try:
+        if settings.database_url is None:
+            require_data_folder(settings.data_dir)
         with unusable_is_told(settings):
             return _in_transaction(action, settings, arguments)
-    except UnusableDatabaseError as error:
+    except (UnusableDatabaseError, DataFolderError) as error:
         print(f"mrasfm: error: {error}", file=sys.stderr)
         return EXIT_CANNOT_RUN
 

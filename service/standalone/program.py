@@ -21,7 +21,7 @@ from service.settings import Settings
 from service.standalone import broker
 from service.standalone.liveness_probe import Pulse
 from service.standalone.supervisor import ChildSpec, Supervisor
-from service.storage.data_folder import exclusive_use, make_private_folder
+from service.storage.data_folder import exclusive_use, make_private_folder, require_data_folder
 
 PROBE_TIMEOUT_S = 2.0
 # A worker that is told to stop ends its stage and gives its job back to the queue; the next start goes on from there.
@@ -56,6 +56,7 @@ def run_standalone(settings: Settings, *, workers: int, log_level: str, say: Say
     """
     port = settings.port or _free_port(settings.host)
     settings = settings.model_copy(update={"data_dir": settings.data_dir.resolve(), "port": port})
+    require_data_folder(settings.data_dir)
     make_private_folder(settings.data_dir)
     with exclusive_use(settings.data_dir) as lock:
         _prepare_records(settings, say)

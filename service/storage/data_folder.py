@@ -11,7 +11,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from schemas.artifacts import CHECKPOINT_FOLDER
+from schemas.file_names import is_ignored
+
 LOCK_FILE = "standalone.lock"
+DATABASE_FILE = "mrasfm.sqlite3"
+# Folders of the state, which may have been restored without the other files, and that of a new disk.
+FOLDERS = frozenset(
+    {"artifacts", "broker", "logs", "lost+found", "metrics", "scratch", "spool", "temporary", "uploads"}
+)
 # What an earlier run left behind is killed within milliseconds of its supervisor's death, but not at once.
 LOCK_TIMEOUT_S = 10.0
 LOCK_POLL_S = 0.1
@@ -19,6 +27,29 @@ LOCK_POLL_S = 0.1
 
 class DataFolderError(Exception):
     """The folder cannot be used; the message says why and what to do."""
+
+
+def require_data_folder(folder: Path) -> None:
+    """Refuse a folder with other files and without the state of a service, which would lie among them.
+
+    Hidden files, and those that a file manager leaves, make no folder somebody's.
+
+    Raises
+    ------
+    DataFolderError
+        That names one of the files, or where the folder cannot be listed.
+    """
+    with _explained(folder):
+        names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    if LOCK_FILE in names or DATABASE_FILE in names:
+        return
+    shown = {name for name in names if not name.startswith(".") or name == CHECKPOINT_FOLDER}
+    foreign = min((name for name in shown - FOLDERS if not is_ignored(name)), default=None)
+    if foreign is not None:
+        raise DataFolderError(
+            f"{folder.resolve()} holds no state of a service, but other files, such as {foreign}. Give --data and a "
+            "new or empty folder, or the one that mrasfm standalone was started with."
+        )
 
 
 def make_private_folder(folder: Path) -> None:

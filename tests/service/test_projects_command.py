@@ -79,6 +79,13 @@ def test_a_folder_without_a_service_is_refused_and_not_made(
     assert not (tmp_path / "typo").exists()
 
 
+def test_no_key_is_created_among_other_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "drive.json").touch()
+    assert mrasfm("keys", "--data", str(tmp_path), "create") == 2
+    assert f"{tmp_path} holds no state of a service, but other files, such as drive.json" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.json"]
+
+
 def test_a_new_key_says_which_service_it_is_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = str(tmp_path / "state")
     assert mrasfm("keys", "--data", folder, "create") == 0, "also before the service has started"

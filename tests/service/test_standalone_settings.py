@@ -19,6 +19,7 @@ from service.database.connections import migrate
 from service.settings import Settings
 from service.standalone import broker
 from service.standalone.program import child_specs
+from service.storage.data_folder import DATABASE_FILE, FOLDERS, LOCK_FILE, DataFolderError, require_data_folder
 
 
 def run(*arguments: str) -> int:
@@ -141,3 +142,39 @@ def test_a_number_of_workers_is_a_number(workers: str, capsys: pytest.CaptureFix
     with pytest.raises(SystemExit):
         run("--workers", workers)
     assert "not a whole number above 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("names", [["drive.json", "images/"], ["pictures/", "report.json"], ["map.json"], [".stages/"]])
+def test_a_folder_of_other_files_is_refused_and_not_touched(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], names: list[str]
+) -> None:
+    """Of a drive, a scene, a map, or a run that was interrupted."""
+    for name in names:
+        (tmp_path / name).mkdir() if name.endswith("/") else (tmp_path / name).touch()
+    tmp_path.chmod(0o755)
+    before = sorted(tmp_path.rglob("*"))
+    # The address is not ours: where the folder were taken, the service would not start all the same.
+    assert run("--data", str(tmp_path), "--host", "192.0.2.1", "--port", "1") == 2
+    told = capsys.readouterr().err
+    assert f"{tmp_path} holds no state of a service, but other files, such as {names[0].rstrip('/')}" in told
+    assert sorted(tmp_path.rglob("*")) == before
+    assert tmp_path.stat().st_mode & 0o777 == 0o755
+
+
+def test_a_folder_of_its_own_and_an_empty_one_are_taken(tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path)
+    folders = ("spool_dir", "uploads_dir", "metrics_dir", "temporary_dir", "scratch_dir")
+    assert {getattr(settings, name).name for name in folders} < FOLDERS
+    assert settings.database_file.name == DATABASE_FILE
+    require_data_folder(tmp_path / "new")
+    require_data_folder(tmp_path)
+    for name in (*FOLDERS, ".hidden", ".DS_Store", "Thumbs.db"):
+        (tmp_path / name).mkdir()
+        require_data_folder(tmp_path)
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(DataFolderError, match=r"notes\.txt"):
+        require_data_folder(tmp_path)
+    for name in (LOCK_FILE, DATABASE_FILE):
+        (tmp_path / name).touch()
+        require_data_folder(tmp_path)
+        (tmp_path / name).unlink()
