@@ -14,7 +14,7 @@ from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError, StorageError
 from mrasfm_engine.export.earlier_scene import require_same_drive
 from mrasfm_engine.export.picture_files import PictureFiles
-from mrasfm_engine.export.publishing import require_free, scratch_folder
+from mrasfm_engine.export.publishing import only_run, require_free, scratch_folder
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -75,11 +75,11 @@ def reconstruct(
     require_free(out, result="scene")
     drive = read_drive(drive_folder, is_new=is_new)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
-    if not force:
-        require_same_drive(out, drive, lambda: run.contents)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
-    with watched_compilation() as compiled:
+    with only_run(out), watched_compilation() as compiled:
+        if not force:
+            require_same_drive(out, drive, lambda: run.contents)
         prior, spans = _begun(run)
         # No name for what was mapped: it is most of what stands in memory, and only the refinement needs it.
         scene, components = stages.refinement(run, stages.mapped(run, spans, prior), prior)

@@ -124,6 +124,56 @@ def while_nothing_moves(out: Path) -> Iterator[None]:
 
 
 @contextmanager
+def only_run(out: Path) -> Iterator[None]:
+    """Keep other runs from making a result in `out` meanwhile; a killed process gives the folder up.
+
+    The lock is that of the folder of finished stages, which goes away where it stays empty.
+
+    Raises
+    ------
+    InputError
+        Where another run is at it.
+    StorageError
+        Where the folder cannot be made.
+    """
+    stages = out / CHECKPOINT_FOLDER
+    made = [path for path in (stages, *stages.parents) if not path.exists()]
+    with ExitStack() as stack:
+        _lock_stages(stages, stack)
+        try:
+            yield
+        finally:
+            with suppress(OSError):  # not empty
+                for path in made:
+                    path.rmdir()
+
+
+def _lock_stages(stages: Path, stack: ExitStack) -> None:
+    while True:
+        try:
+            stages.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(stages, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:  # a run that ends has just removed it
+            continue
+        except OSError as error:
+            raise storage_error(stages, error) from error
+        stack.callback(os.close, descriptor)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(
+                f"another run is making a result in {stages.parent}",
+                remedy="Wait until it has ended, or give another folder with --out.",
+                code="output-in-use",
+            ) from None
+        except OSError:  # a file system without locks
+            return
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(descriptor), stages.stat()):
+                return
+
+
+@contextmanager
 def _held(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder's lock, which a killed process gives up.
 

@@ -32,6 +32,11 @@ def test_interrupted_run_resumes(variant: Variant, mrasfm: Run, number: int, cod
     variant.keep(cameras=["front", "left"], units=5).save()
     process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     _wait_for(variant.scene / ".stages" / "features.npz")
+    process.send_signal(signal.SIGSTOP)  # it does not end meanwhile
+    beside = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
+    assert beside.code == EXIT_BAD_INPUT
+    assert f"another run is making a result in {variant.scene}" in beside.err
+    process.send_signal(signal.SIGCONT)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == code

@@ -23,7 +23,7 @@ from mrasfm_engine.export.calibration import calibration_document, document_in_m
 from mrasfm_engine.export.colmap import approximations, colmap_models
 from mrasfm_engine.export.feature_database import write_features, write_matches
 from mrasfm_engine.export.pose_files import poses_document
-from mrasfm_engine.export.publishing import require_free
+from mrasfm_engine.export.publishing import only_run, require_free
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.images import read_image_rgb
@@ -651,6 +651,21 @@ def test_a_folder_with_files_that_no_scene_has_made_is_refused(tmp_path: Path, n
     require_free(tmp_path / "new", result="scene")
     (tmp_path / ".stages").mkdir()
     require_free(tmp_path, result="scene")  # of a run that was interrupted
+
+
+def test_one_run_at_a_time_makes_a_result_in_a_folder(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "scene"
+    with only_run(out):
+        with pytest.raises(InputError, match=r"another run is making a result in .*scene") as found, only_run(out):
+            pytest.fail("the folder is taken")
+        (out / ".stages" / "features.npz").touch()
+    assert found.value.code == "output-in-use"
+    with only_run(out):
+        (out / ".stages" / "features.npz").unlink()
+    assert (out / ".stages").is_dir()  # it was there before
+    with pytest.raises(CancelledError), only_run(tmp_path / "other" / "scene"):
+        raise CancelledError
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
 @pytest.mark.parametrize("report", ['{"summary": {"passed": 3}, "tests": []}', '{"summary": 3}', "[[]]", "[" * 100_000])
