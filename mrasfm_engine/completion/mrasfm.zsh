@@ -256,7 +256,7 @@ _shtab_mrasfm_keys_revoke_defaults_added=0
 
 _shtab_mrasfm_map_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "--url[URL of the service, for example http\:\/\/127.0.0.1\:8000]:url:"
+  "--url[URL of the service, for example http\:\/\/127.0.0.1\:8000\; default\: that of MRASFM_URL]:url:"
   "--key-file[file that holds the API key and nothing else]:FILE:"
   "--parallel[files at one time (default\: 4)]:N:"
   "--json[print one JSON object at the end]"
@@ -459,7 +459,7 @@ _shtab_mrasfm_synth_defaults_added=0
 
 _shtab_mrasfm_upload_options=(
   "(- : *)"{-h,--help}"[show this help message and exit]"
-  "--url[URL of the service, for example http\:\/\/127.0.0.1\:8000]:url:"
+  "--url[URL of the service, for example http\:\/\/127.0.0.1\:8000\; default\: that of MRASFM_URL]:url:"
   "--key-file[file that holds the API key and nothing else]:FILE:"
   "--parallel[files at one time (default\: 4)]:N:"
   "--json[print one JSON object at the end]"

@@ -10,6 +10,7 @@
 What can go wrong is a `ClientError`: an `ApiError` carries the problem that the service answered with.
 """
 
+from schemas.api.jobs import JobKind, JobState
 from service.client.api import Client, JobEvent, Result
 from service.client.async_client import AsyncClient
 from service.client.download import Downloaded, download
@@ -30,7 +31,9 @@ __all__ = [
     "DriveFolder",
     "DriveFolderError",
     "JobEvent",
+    "JobKind",
     "JobNews",
+    "JobState",
     "LocalFile",
     "Result",
     "SceneFolderError",

@@ -135,7 +135,8 @@ class _Lines:
         self._maybe(mark, f"{stage}: {done_bytes / 1e6:.1f} of {total_bytes / 1e6:.1f} MB")
 
     def job(self, news: JobNews) -> None:
-        self._maybe(("job", news.state, news.stage or "", str(news.attempt)), f"job: {described(news)}")
+        stage = "" if news.state in ENDED else news.stage or ""
+        self._maybe(("job", news.state, stage, str(news.attempt)), f"job: {described(news)}")
 
     def _maybe(self, mark: tuple[str, ...], line: str) -> None:
         with self._lock:

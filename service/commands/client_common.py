@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from service.client import Client, DriveFolder, Result, Sent, UploadState
     from service.client.display import Display
 
-KEY_VARIABLE = "MRASFM_API_KEY"
+KEY_VARIABLE, URL_VARIABLE = "MRASFM_API_KEY", "MRASFM_URL"
 EXIT_REFUSED, EXIT_JOB_FAILED, EXIT_UNREACHABLE, EXIT_INTERRUPTED = 2, 3, 4, 130
 _SHOWN_ITEMS = 20
 _EPILOG = f"""\
@@ -121,7 +121,9 @@ def add_command(
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,  # --key SECRET must not pass for --key-file
     )
-    parser.add_argument("--url", required=True, help="URL of the service, for example http://127.0.0.1:8000")
+    parser.add_argument(
+        "--url", help=f"URL of the service, for example http://127.0.0.1:8000; default: that of {URL_VARIABLE}"
+    )
     parser.add_argument("--key-file", type=Path, metavar="FILE", help="file that holds the API key and nothing else")
     parser.add_argument("--parallel", type=_count, default=4, metavar="N", help="files at one time (default: 4)")
     parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
@@ -149,7 +151,7 @@ def _conversed(
     try:
         if arguments.out is not None:
             require_free(arguments.out, None)  # now, not after an hour of waiting
-        with Client(arguments.url, _key(arguments.key_file), connections=arguments.parallel + 1) as client:
+        with Client(_url(arguments.url), _key(arguments.key_file), connections=arguments.parallel + 1) as client:
             _warn_of_plain_http(client.url, display)
             return converse(Conversation(client, arguments, summary, display))
     except UnreachableError as error:
@@ -208,6 +210,15 @@ def _is_trouble(status: int) -> bool:
     After many tries, requests that arrive too slowly (408) are a network that does not carry them.
     """
     return status == 408 or (status >= 500 and status != 507)
+
+
+def _url(given: str | None) -> str:
+    from service.client import ClientError
+
+    url = given or os.environ.get(URL_VARIABLE, "")
+    if not url:
+        raise ClientError(f"there is no URL of a service. Give --url, or set {URL_VARIABLE}.")
+    return url
 
 
 def _key(key_file: Path | None) -> str:

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import islice
 from typing import TYPE_CHECKING, Any
 
 from schemas.command_line import output_folder
@@ -17,10 +18,12 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
     from schemas.api.exports import ExportRequest, ExportResource
+    from schemas.api.jobs import JobResource
     from service.client import Client, Result
 
 Converse = Callable[[Conversation, "Summary"], int]
 LISTS = ("drives", "jobs", "scenes", "maps", "exports", "webhooks")
+MOST_LISTED = 10**9
 _KINDS = {"drv": "drive", "job": "job", "scn": "scene", "map": "map", "exp": "export", "whk": "webhook"}
 _SHOWN = ("name", "kind", "state", "formats", "url", "event", "created_at")
 
@@ -36,7 +39,7 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     """Add the subcommands."""
     parser = _command(subparsers, "list", "list what the project has", _list)
     parser.add_argument("what", choices=LISTS, help="kind of what is listed, newest first")
-    parser.add_argument("--limit", type=int, default=50, metavar="N", help="how many (default: 50)")
+    _add_limit(parser)
     parser.add_argument("--state", action="append", dest="states", metavar="STATE", help="only jobs in this state, "
                         "such as FAILED; may be repeated")  # fmt: skip
     parser.add_argument("--kind", action="append", dest="kinds", metavar="KIND", help="only jobs of this kind, such as "
@@ -45,11 +48,11 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map also MAP/VERSION")
     parser = _command(subparsers, "delete", "delete a drive, scene, map, export or webhook", _delete)
     parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map's version MAP/VERSION")
-    parser = _command(subparsers, "cancel", "cancel a job", _cancel)
-    parser.add_argument("id", metavar="JOB", help="id of the job")
-    parser = _command(subparsers, "retry", "do a job again that failed or was cancelled", _retry)
-    parser.add_argument("id", metavar="JOB", help="id of the job")
-    parser.add_argument("--wait", action="store_true", help="wait for the end of the new job")
+    parser = _command(subparsers, "cancel", "cancel jobs", _cancel)
+    parser.add_argument("ids", nargs="+", metavar="JOB", help="id of a job")
+    parser = _command(subparsers, "retry", "do jobs again that failed or were cancelled", _retry)
+    parser.add_argument("ids", nargs="+", metavar="JOB", help="id of a job")
+    parser.add_argument("--wait", action="store_true", help="wait for the end of the new jobs")
     parser = _command(subparsers, "wait", "wait for the end of a job", _wait)
     parser.add_argument("id", metavar="JOB", help="id of the job")
     parser = _command(subparsers, "download", "download a scene, a map or an export", _download, has_out=True)
@@ -78,7 +81,17 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
     parser.add_argument("id", metavar="WEBHOOK", help="id of the webhook")
     parser = _command(subparsers, "deliveries", "list the messages to a webhook", _deliveries)
     parser.add_argument("id", metavar="WEBHOOK", help="id of the webhook")
-    parser.add_argument("--limit", type=int, default=50, metavar="N", help="how many (default: 50)")
+    _add_limit(parser)
+
+
+def _add_limit(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--limit", type=_limit, default=50, metavar="N", help="how many (default: 50)")
+
+
+def _limit(text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= MOST_LISTED:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {MOST_LISTED}")
+    return int(text)
 
 
 def _command(
@@ -116,9 +129,9 @@ def _only(arguments: argparse.Namespace) -> dict[str, Any]:
         raise ClientError(f"{arguments.what} have no state or kind. Give --state and --kind with `list jobs`.")
     for name, (words, values) in given.items():
         for word in words:
-            if word not in list(values):
+            if word.upper() not in list(values):
                 raise ClientError(f"--{name[:-1]} is {word!r}. Give one of {', '.join(values)}.")
-    return {name: words for name, (words, _) in given.items()}
+    return {name: [word.upper() for word in words] for name, (words, _) in given.items()}
 
 
 def _deliveries(conversation: Conversation, summary: Summary) -> int:
@@ -127,13 +140,33 @@ def _deliveries(conversation: Conversation, summary: Summary) -> int:
 
 
 def _print(conversation: Conversation, summary: Summary, items: Iterable[BaseModel], *, limit: int) -> int:
-    for _, item in zip(range(limit), items, strict=False):
+    rest = iter(items)
+    for item in islice(rest, limit):
         shown = item.model_dump(mode="json")
         summary.items.append(shown)
         if not conversation.arguments.json:
             words = [str(shown[name]) for name in _SHOWN if shown.get(name) not in (None, "")]
-            print("  ".join([shown["id"], *words]), flush=True)
+            print("  ".join([shown["id"], *words, *_of_job(shown)]), flush=True)
+    if next(rest, None) is not None:
+        conversation.say(f"there are more than these {limit}: --limit lists them")
     return 0
+
+
+def _of_job(shown: dict[str, Any]) -> list[str]:
+    """Stage, drives and problem of a job, what it repeats; nothing of another resource."""
+    from schemas.api.problems import PROBLEM_TYPE
+
+    if "progress" not in shown:
+        return []
+    progress, problem = shown["progress"], shown["problem"]
+    words = [member["name"] for member in shown["members"]] or [shown["drive_id"] or shown["map_id"] or ""]
+    if shown["state"] in ("RUNNING", "STALLED"):
+        words.append(f"{progress['stage'] or ''} {progress['percent']:.0f} %".strip())
+    if shown["retry_of"]:
+        words.append(f"retry of {shown['retry_of']}")
+    if problem:
+        words.append(f"{problem['type'].removeprefix(PROBLEM_TYPE)}: {problem['detail']}")
+    return [word for word in words if word]
 
 
 def _show(conversation: Conversation, summary: Summary) -> int:
@@ -188,14 +221,21 @@ def _delete(conversation: Conversation, summary: Summary) -> int:
 
 
 def _cancel(conversation: Conversation, summary: Summary) -> int:
-    conversation.note_job(conversation.client.cancel_job(conversation.arguments.id))
+    for job_id in conversation.arguments.ids:
+        _note(conversation, summary, conversation.client.cancel_job(job_id))
     return 0
 
 
 def _retry(conversation: Conversation, summary: Summary) -> int:
-    job = conversation.client.retry_job(conversation.arguments.id)
+    made = [conversation.client.retry_job(job_id) for job_id in conversation.arguments.ids]
+    for job in made:
+        _note(conversation, summary, job)
+    return max(_ended(conversation, job.id) for job in made) if conversation.arguments.wait else 0
+
+
+def _note(conversation: Conversation, summary: Summary, job: JobResource) -> None:
     conversation.note_job(job)
-    return _ended(conversation, job.id) if conversation.arguments.wait else 0
+    summary.items.append(job.model_dump(mode="json"))
 
 
 def _wait(conversation: Conversation, summary: Summary) -> int:

@@ -16,13 +16,14 @@ from sqlalchemy import delete
 
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobState
+from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.api.webhooks import WebhookEvent, WebhookRequest
 from service.client import ApiError, AsyncClient, Client, ClientError, download, watch_job
 from service.client import api as client_api
 from service.commands.client_program import main
 from service.database.tables import Job
-from service.domain import exports
-from tests.helpers.live_api import SCENE_FILES
+from service.domain import exports, jobs
+from tests.helpers.live_api import LIMITS, SCENE_FILES
 from tests.helpers.live_api import Client as Owner
 from tests.service.client.conftest import Connect
 
@@ -144,6 +145,45 @@ def run(client: Owner, capsys: pytest.CaptureFixture[str], *words: str) -> tuple
     return code, told
 
 
+def test_a_list_of_jobs_says_which_drive_and_why(
+    client: Owner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MRASFM_API_KEY", client.key)
+    monkeypatch.setenv("MRASFM_URL", client.api.url)
+    drive_ids = [client.committed() for _ in range(3)]
+    failed, runs, waits = (client.reconstruct(drive_id)["id"] for drive_id in drive_ids)
+    held, running = client.claim(failed), client.claim(runs)
+    detail = "no image of the drive has a keypoint"
+    problem = Problem(
+        type=PROBLEM_TYPE + "no-features", title="No features", detail=detail, remedy="Look.", retryable=False
+    )
+    with client.api.database.write() as session:
+        jobs.fail(session, held, problem, limits=LIMITS, retry_delay_us=0)
+    with client.api.database.write() as session:
+        note = jobs.ProgressNote(
+            stage="matches", done=1, total=2, unit="pairs", percent=33.4, eta_low_s=1.0, eta_high_s=2.0, reused=()
+        )
+        jobs.heartbeat(session, running, lease_us=60_000_000, note=note)
+    assert main(["list", "jobs", "--kind", "RECONSTRUCTION", "--limit", "2"]) == 0
+    shown, said = capsys.readouterr()
+    newest, second = shown.splitlines()
+    assert newest.split()[:3] == [waits, "RECONSTRUCTION", "QUEUED"]
+    assert newest.endswith(drive_ids[2])
+    assert second.endswith(f"{drive_ids[1]}  matches 33 %")
+    assert "--limit" in said, "there is a third"
+    assert main(["list", "jobs", "--state", "failed"]) == 0
+    assert capsys.readouterr().out.strip().endswith(f"{drive_ids[0]}  no-features: {detail}")
+    assert main(["retry", failed]) == 0
+    assert main(["cancel", runs, waits]) == 0
+    assert main(["list", "jobs", "--limit", "1"]) == 0
+    assert capsys.readouterr().out.strip().endswith(f"retry of {failed}")
+    with pytest.raises(SystemExit):
+        main(["list", "jobs", "--limit", "0"])
+    monkeypatch.delenv("MRASFM_URL")
+    assert main(["list", "jobs"]) == 2
+    assert "MRASFM_URL" in capsys.readouterr().err
+
+
 def test_an_export_outlives_the_record_of_its_job(
     client: Owner, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -183,7 +223,7 @@ def test_commands(
     assert run(client, capsys, "wait", job["id"])[0] == 3
     only = ("--kind", "RECONSTRUCTION", "--state", "CANCELLED", "--state", "FAILED")
     assert [item["id"] for item in run(client, capsys, "list", "jobs", *only)[1]["items"]] == [job["id"]]
-    assert run(client, capsys, "list", "jobs", *only[:2], "--state", "RUNNING")[1]["items"] == []
+    assert run(client, capsys, "list", "jobs", *only[:2], "--state", "running")[1]["items"] == []
     assert run(client, capsys, "retry", job["id"])[1]["job_id"] != job["id"]
     code, told = run(client, capsys, "webhook", "https://example.org/", "--event", "job.failed")
     assert told["items"][0]["secret"].startswith("whsec_")
@@ -194,7 +234,7 @@ def test_commands(
     assert run(client, capsys, "delete", webhook_id)[0] == 0
     for words in (
         ("list", "scenes", "--state", "FAILED"),
-        ("list", "jobs", "--state", "failed"),
+        ("list", "jobs", "--state", "broken"),
         ("show", "abc"),
         ("show", "scn_0/1"),
         ("delete", job["id"]),
