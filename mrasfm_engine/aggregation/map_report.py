@@ -330,22 +330,28 @@ def _seam_pictures(result: MapResult, seam: Seam) -> dict[str, Any]:
     by, off = "their first units put them, without positions", ""
     if "positions_off_m" in quality:
         by, off = "their positions put them", f"{quality['positions_off_m']:.2f} m off, "
-    before = seam_picture(
+    titles = (
         [f"{seam.a} (orange) and {seam.b} (blue), as {by}", "before aggregation: "
          f"{off}residual {quality['residual_before_px']:.1f} px"],
+        [f"{seam.a} (orange) and {seam.b} (blue), in the map", f"after: {quality['inliers']} shared points, residual "
+         f"{quality['residual_after_px']:.2f} px"],
+    )  # fmt: skip
+    before = seam_picture(
+        titles[0],
         (points_a, se3.apply(coarse, scene_b.points_m)),
         (trajectory_a, se3.apply(coarse, scene_b.trajectory_m)),
         centre,
         side,
-    )  # fmt: skip
+        title_of_other=titles[1],
+    )
     after = seam_picture(
-        [f"{seam.a} (orange) and {seam.b} (blue), in the map", f"after: {quality['inliers']} shared points, residual "
-         f"{quality['residual_after_px']:.2f} px"],
+        titles[1],
         (points_a, points_b),
         (trajectory_a, trajectory_b),
         centre,
         side,
-    )  # fmt: skip
+        title_of_other=titles[0],
+    )
     return {BEFORE: before, AFTER: after}
 
 

@@ -22,6 +22,8 @@ def seam_picture(
     trajectories_m: tuple[Floats, Floats],
     centre_m: Floats,
     side_m: float,
+    *,
+    title_of_other: Sequence[str] = (),
 ) -> Bytes:
     """A picture (h, w, 3) of the ground around a place, east to the right and north up.
 
@@ -31,6 +33,8 @@ def seam_picture(
         Points (n, 3) and units' positions (u, 3) of the two scenes, in one frame.
     side_m
         Of the square that is shown.
+    title_of_other
+        Title of the picture that this one is compared with: both are equally wide.
     """
     cell_m = side_m / SIDE_PX
     picture = np.full((SIDE_PX, SIDE_PX, 3), 255.0)
@@ -55,7 +59,8 @@ def seam_picture(
         for u, v in pixels(trajectory).tolist():
             cv2.circle(drawn, (int(u), int(v)), 4, color, -1, cv2.LINE_AA)
             cv2.circle(drawn, (int(u), int(v)), 4, (30, 30, 30), 1, cv2.LINE_AA)
-    return framed(drawn, title, cell_m=cell_m, arrows=[("N", (0.0, 1.0))]).picture
+    arrows = [("N", (0.0, 1.0))]
+    return framed(drawn, title, cell_m=cell_m, arrows=arrows, lines_of_other=title_of_other).picture
 
 
 def shown_square(places_m: Floats) -> tuple[Floats, float]:

@@ -164,6 +164,15 @@ def _picture(
     agreement: tuple[Agreement, Agreement] | None,
     plan_from_world: Floats,
 ) -> Framed:
+    lines = [_title_lines(scene, mosaic, one, agreement) for one in (GIVEN, REFINED)]
+    arrows = [("drive", (1.0, 0.0))]
+    if scene.georeference is not None:
+        arrows.append(("north", (float(plan_from_world[0, 1]), float(plan_from_world[1, 1]))))
+    drawn = chequerboard(mosaic, which, gains)
+    return framed(drawn, lines[which], cell_m=mosaic.grid.cell_m, arrows=arrows, lines_of_other=lines[1 - which])
+
+
+def _title_lines(scene: Scene, mosaic: Mosaic, which: int, agreement: tuple[Agreement, Agreement] | None) -> list[str]:
     title = f"{scene.drive.manifest.name}: the road from above, "
     title += "calibration as given" if which == GIVEN else "calibration as refined"
     if which == REFINED and not calibration_changed(scene):
@@ -174,10 +183,7 @@ def _picture(
         note += f"; correlation between cameras {agreement[which].correlation:.2f}"
         if np.isfinite(agreement[which].displacement_m):
             note += f", displacement {100 * agreement[which].displacement_m:.1f} cm"
-    arrows = [("drive", (1.0, 0.0))]
-    if scene.georeference is not None:
-        arrows.append(("north", (float(plan_from_world[0, 1]), float(plan_from_world[1, 1]))))
-    return framed(chequerboard(mosaic, which, gains), [title, note], cell_m=mosaic.grid.cell_m, arrows=arrows)
+    return [title, note]
 
 
 def chequerboard(mosaic: Mosaic, which: int, gains: Floats) -> Bytes:

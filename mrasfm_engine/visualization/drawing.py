@@ -13,6 +13,7 @@ from mrasfm_engine.types import Bytes
 
 FONT = cv2.FONT_HERSHEY_SIMPLEX
 INK, PAPER = (30, 30, 30), (255, 255, 255)
+MARGIN_PX = 10  # beside the title lines
 BAR_LENGTHS_M = (0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
 
 
@@ -25,9 +26,14 @@ class Framed:
 
 
 def framed(
-    picture: Bytes, lines: Sequence[str], *, cell_m: float, arrows: Sequence[tuple[str, tuple[float, float]]]
+    picture: Bytes,
+    lines: Sequence[str],
+    *,
+    cell_m: float,
+    arrows: Sequence[tuple[str, tuple[float, float]]],
+    lines_of_other: Sequence[str] = (),
 ) -> Framed:
-    """The picture under its title lines, above a scale bar and arrows.
+    """The picture under its title lines, above a scale bar and arrows. The frame is as wide as its longest line.
 
     Parameters
     ----------
@@ -35,15 +41,18 @@ def framed(
         (h, w, 3) red, green, blue.
     arrows
         Labels and directions (x right, y up) in the picture.
+    lines_of_other
+        Title lines of a picture of the same size that this one is compared with: both frames are equally wide.
     """
     height, width = picture.shape[:2]
     size = float(np.clip(width / 1800, 0.45, 1.2))
     line = round(34 * size) + 6
     top, bottom = line * len(lines) + 12, 3 * line
-    out = np.full((height + top + bottom, max(width, 640), 3), PAPER, np.uint8)
+    widest = max((_text_width(text, size) for text in (*lines, *lines_of_other)), default=0)
+    out = np.full((height + top + bottom, max(width, 640, widest + 2 * MARGIN_PX), 3), PAPER, np.uint8)
     out[top : top + height, :width] = picture
     for k, text in enumerate(lines):
-        write_text(out, text, (10, line * (k + 1)), size=size)
+        write_text(out, text, (MARGIN_PX, line * (k + 1)), size=size)
     _scale_bar(out, (20, top + height + line), width, cell_m, size)
     x = out.shape[1] - round(90 * size) - 10
     for label, direction in reversed(arrows):
@@ -69,10 +78,17 @@ def write_text(
     size
         Of OpenCV's fonts: capitals are about 21 pixels high times that.
     """
-    thick = max(1, round(1.6 * size))
-    width = cv2.getTextSize(text, FONT, size, thick)[0][0]
+    width = _text_width(text, size)
     shift = {"left": 0, "centre": width // 2, "right": width}[align]
-    cv2.putText(picture, text, (at[0] - shift, at[1]), FONT, size, INK, thick, cv2.LINE_AA)
+    cv2.putText(picture, text, (at[0] - shift, at[1]), FONT, size, INK, _thickness(size), cv2.LINE_AA)
+
+
+def _text_width(text: str, size: float) -> int:
+    return int(cv2.getTextSize(text, FONT, size, _thickness(size))[0][0])
+
+
+def _thickness(size: float) -> int:
+    return max(1, round(1.6 * size))
 
 
 def _scale_bar(out: Bytes, at: tuple[int, int], width: int, cell_m: float, size: float) -> None:

@@ -33,6 +33,19 @@ def test_the_frame_keeps_the_picture_and_draws_a_scale_of_the_right_length() -> 
     assert 198 <= longest <= 206  # 5 m: the longest round length within a quarter of the width
 
 
+def test_the_frame_is_as_wide_as_the_longest_line_and_that_of_the_other_picture() -> None:
+    picture = np.full((400, 700, 3), 120, np.uint8)
+    long = "1 pixel = 0.01 m, " + "tiles of 2 m alternate between the two best cameras; " * 3 + "displacement 2.5 cm"
+    out = framed(picture, ["title", long], cell_m=0.01, arrows=[("drive", (1.0, 0.0))])
+    assert out.picture.shape[1] > 1000
+    heading = out.picture[: out.top_px]
+    assert (heading[:, -9:] == 255).all(), "no line reaches the edge"
+    assert (heading[:, -40:] < 128).any(), "and the longest ends near it"
+    np.testing.assert_array_equal(out.picture[out.top_px : out.top_px + 400, :700], picture)
+    other = framed(picture, ["title", "short"], cell_m=0.01, arrows=[], lines_of_other=["title", long])
+    assert (other.picture.shape, other.top_px) == (out.picture.shape, out.top_px)
+
+
 def test_tiles_alternate_between_the_two_best_cameras_and_are_equally_bright() -> None:
     grid = Grid(left_m=0.0, top_m=0.0, cell_m=0.5, rows=40, columns=50)  # tiles of 16 cells
     owner = np.zeros((2, 40, 50), np.uint8)
