@@ -12,6 +12,7 @@ from mrasfm_engine.export.report_page._html import (
     PREVIEW_BYTES,
     facts,
     number,
+    number_with_sigma,
     page,
     pair,
     section,
@@ -30,8 +31,8 @@ SEAM_FIGURES = (
     ("residual_after_px", "Residual after", "px"),
     ("sigma_translation_m", "Sigma of the translation", "m"),
     ("sigma_rotation_deg", "Sigma of the rotation", "deg"),
-    ("scale", "Scale of the second scene against the first", ""),
 )
+SCALE_DIGITS = 5  # where its sigma is not known
 
 
 def map_page(
@@ -109,6 +110,8 @@ def _seams(document: Mapping[str, Any], folder: Path | None = None, room_bytes: 
         accepted, reason = seam["accepted"], text(seam.get("reason", "the evidence does not suffice"))
         state = "accepted" if accepted else f"rejected: {reason}"
         figures = {label: number(seam[name], unit) for name, label, unit in SEAM_FIGURES if seam.get(name) is not None}
+        if seam.get("scale") is not None:
+            figures["Scale of the second scene against the first"] = _scale(seam["scale"], seam.get("sigma_scale"))
         drawn = ""
         if folder is not None and "pictures" in seam:
             each = int(room_bytes / BASE64 / 2 / left)
@@ -119,6 +122,10 @@ def _seams(document: Mapping[str, Any], folder: Path | None = None, room_bytes: 
         yield section(f"Seam of {seam['a']} and {seam['b']}", f"<p>{state}</p>\n", facts(figures), drawn)
     if not document["seams"]:
         yield section("Seams", "<p>No two scenes are close enough to one another to look for a seam.</p>\n")
+
+
+def _scale(scale: float, sigma: float | None) -> str:
+    return number_with_sigma(scale, sigma) if sigma else number(scale, digits=SCALE_DIGITS)
 
 
 def _pictures(names: Mapping[str, str], folder: Path, each_bytes: int, room_bytes: int) -> str:

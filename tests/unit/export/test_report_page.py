@@ -172,6 +172,9 @@ def test_what_cannot_be_made_is_withheld(tmp_path: Path, monkeypatch: pytest.Mon
     assert "report.html is withheld: it cannot be written: ValueError: no page" in notes
 
 
+MAP_SUMMARY = {"registered_images": 4, "total_images": 4, "georeferenced": True}
+
+
 def map_document(seams: int) -> dict[str, Any]:
     """Of two scenes; all seams have the same pictures."""
     shown = {"pictures": {"before": "pictures/birds_eye_before.png", "after": "pictures/birds_eye_after.png"}}
@@ -194,8 +197,7 @@ def page_of_map(folder: Path, seams: int, calibrations: dict[str, Any], image: N
             (folder / "pictures" / name).write_bytes(data)
         else:
             cv2.imwrite(str(folder / "pictures" / name), image)
-    summary = {"registered_images": 4, "total_images": 4, "georeferenced": True}
-    return map_page(map_document(seams), folder, REPORT | {"summary": summary}, calibrations)
+    return map_page(map_document(seams), folder, REPORT | {"summary": MAP_SUMMARY}, calibrations)
 
 
 def test_a_map_names_its_seams_and_shows_the_calibration_of_each_drive(written: Path, tmp_path: Path) -> None:
@@ -217,6 +219,22 @@ def test_a_map_names_its_seams_and_shows_the_calibration_of_each_drive(written: 
     other["cameras"]["left"]["difference"]["rotation_vector_deg"][0] = 3.0
     faults = list(faults_of(tmp_path / "report.html", calibrations))
     assert faults == ["the rotation of left about x is another in two"]
+
+
+@pytest.mark.parametrize(
+    ("sigma", "words"),
+    [(0.0005312, "1.00213 <small>± 0.00053"), (0.0412, "1.002 <small>± 0.041"), (None, "1.0021"), (0.0, "1.0021")],
+)
+def test_the_scale_of_a_seam_has_the_digits_that_its_sigma_is_worth(
+    tmp_path: Path, sigma: float | None, words: str
+) -> None:
+    document = map_document(0)
+    document["seams"][1] |= {"scale": 1.0021299} | ({} if sigma is None else {"sigma_scale": sigma})
+    found = map_page(document, tmp_path, REPORT | {"summary": MAP_SUMMARY}, {})
+    shown = re.search(r"<dt>Scale of the second scene against the first</dt><dd>(.*?)</dd>", found)
+    assert shown is not None
+    assert 'data-value="1.0021299"' in shown[1]
+    assert f">{words}<" in shown[1]
 
 
 @pytest.mark.parametrize(("seams", "drawn"), [(12, 12), (120, 20)])
