@@ -36,6 +36,8 @@ class Attempt:
         SHA-256 of these files by name: what finished stages are found again by.
     settings
         As in the API's `ReconstructionSettings`.
+    name
+        Of an aggregation: the map's, for its report.
     scenes, into, remove
         Of an aggregation: folders of scenes by name, folder of the map that they are added to, names of scenes that it
         shall lose.
@@ -57,6 +59,7 @@ class Attempt:
     settings: Mapping[str, Any]
     drive: Path | None = None
     content_sha256: Mapping[str, str] | None = None
+    name: str = ""
     scenes: Mapping[str, Path] = field(default_factory=dict)
     into: Path | None = None
     remove: Sequence[str] = field(default_factory=list)

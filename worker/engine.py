@@ -121,7 +121,8 @@ def _aggregate(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
     def complete(report: dict[str, Any]) -> None:
-        """Name the drives without a scene: the engine knows of those alone that fit into no map."""
+        """Name the map, and the drives without a scene: the engine knows of those alone that fit into no map."""
+        report["name"] = request.name
         unfit = [
             {**_member(request, found["scene"]), "name": found["scene"], "problem": _problem(found)}
             for found in report.pop("left_out")

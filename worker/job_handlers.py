@@ -202,6 +202,7 @@ class AggregationHandler:
         return Attempt(
             work=Work.AGGREGATION,
             settings=self._held.settings,
+            name=inputs.name,
             scenes={name: root / "scenes" / name for name in inputs.scenes},
             into=into,
             remove=inputs.remove,

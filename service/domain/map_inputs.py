@@ -18,7 +18,7 @@ from schemas.artifacts import (
     is_read_by_aggregation,
     is_read_by_next_version,
 )
-from service.database.tables import Blob, Job, MapFile, SceneFile
+from service.database.tables import Blob, Job, Map, MapFile, SceneFile
 from service.domain import jobs, maps
 
 
@@ -36,6 +36,8 @@ class MapInputs:
 
     Attributes
     ----------
+    name
+        The map's.
     scenes
         Files of the scenes that come, by name.
     base
@@ -52,6 +54,7 @@ class MapInputs:
         Whether a scene that fits into no map takes the others with it.
     """
 
+    name: str
     scenes: Mapping[str, Sequence[StoredArtifact]]
     base: Sequence[StoredArtifact]
     remove: Sequence[str]
@@ -70,6 +73,7 @@ def inputs_of(session: Session, job_id: str) -> MapInputs:
     request = job.request or {}
     files = {name: _files_of_scene(session, scene_id) for name, scene_id in coming.items()}
     return MapInputs(
+        name=session.get_one(Map, job.map_id).name,
         scenes=files,
         base=_files_of_version(session, job.map_id, request.get("base_version")),
         remove=list(request.get("remove", ())),

@@ -11,12 +11,15 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
+from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.synthetic.drive_writer import render_drives
 from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
 from service.database.tables import Blob, Job, MapFile, MapScene, MapVersion
 from service.domain import aggregations, jobs, scenes
 from service.job_queue import JobQueue
+from tests.helpers.export_example import make_scene
+from tests.helpers.export_images import USUAL, written
 from tests.helpers.live_api import SUMMARY
 from tests.helpers.service_world import TERMINAL, World, is_gone, kill, wait_until
 from tests.helpers.small_scenes import drive_along, make_street
@@ -59,16 +62,32 @@ def versions(world: World) -> list[MapVersion]:
 
 
 def document(world: World, number: int, path: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(stored(world, number, path))
+    return found
+
+
+def stored(world: World, number: int, path: str) -> bytes:
     with world.database.read() as session:
         mine = (MapFile.number == number) & (MapFile.path == path)
         key = session.scalars(select(Blob.key).join(MapFile, MapFile.blob_id == Blob.id).where(mine)).one()
-    found: dict[str, Any] = json.loads(world.artifacts.read(key))
-    return found
+    return world.artifacts.read(key)
 
 
 def paths(world: World, number: int) -> set[str]:
     with world.database.read() as session:
         return set(session.scalars(select(MapFile.path).where(MapFile.number == number)))
+
+
+@pytest.mark.slow
+def test_a_map_is_titled_by_its_name(unpowered: World, tmp_path: Path) -> None:
+    ids = [scene_of_example(unpowered, tmp_path, name) for name in ("a", "b")]
+    job, due = ask(unpowered, scenes=ids, name="kitti street")
+    run(unpowered, *due)
+    assert unpowered.job(job.id).state == "SUCCEEDED", unpowered.job(job.id).problem
+    assert document(unpowered, 1, "report.json")["name"] == "kitti street"
+    page = stored(unpowered, 1, "report.html").decode()
+    assert "<title>kitti street: map</title>" in page
+    assert '<p class="kind">Map</p><h1>kitti street</h1>' in page
 
 
 @pytest.mark.slow
@@ -122,6 +141,21 @@ def publish_scene(world: World, folder: Path, drive: Path) -> tuple[str, str]:
         held = jobs.claim(session, job_id, owner="worker@test", lease_us=60_000_000)
         assert held is not None
         return drive_id, scenes.publish(session, held, files=stored, summary=SUMMARY, expires_us=None)
+
+
+def named_drive(root: Path, name: str) -> Path:
+    """The example as a drive; its images show too little for a reconstruction."""
+    written(root / name, USUAL)
+    manifest = json.loads((root / name / "drive" / "drive.json").read_text())
+    (root / name / "drive" / "drive.json").write_text(json.dumps(manifest | {"name": name}))
+    return root / name / "drive"
+
+
+def scene_of_example(world: World, root: Path, name: str) -> str:
+    """The example's scene, with other files of images than others of it, as that of a drive; its id."""
+    drive = named_drive(root, name)
+    write_scene(make_scene(folder=name), root / name / "made", {"settings": {"features": {"extractor": "sift"}}})
+    return publish_scene(world, root / name / "made", drive)[1]
 
 
 @pytest.mark.slow

@@ -44,8 +44,9 @@ def share_verdict(summary: Mapping[str, Any], what: str) -> str:
 
 
 def heading(kind: str, name: str, version: object, lines: Sequence[str], summary: Mapping[str, Any]) -> str:
-    """Title, verdicts and figures."""
-    title = f'<p class="kind">{text(kind)}</p><h1>{text(name)}</h1><p>MRASfM {text(version)}</p>'
+    """Title, verdicts and figures; without a line for the kind where that is empty."""
+    above = f'<p class="kind">{text(kind)}</p>' if kind else ""
+    title = f"{above}<h1>{text(name)}</h1><p>MRASfM {text(version)}</p>"
     verdicts = section("Verdicts", items(lines, "verdicts"), facts(summary_facts(summary)))
     return f"<header>{title}</header>\n{verdicts}"
 

@@ -49,6 +49,8 @@ def map_page(
         `map.json`.
     folder
         The map's, whose `pictures/` are written already.
+    report
+        `report.json` with its `summary`; `name` is that of the map where it has one.
     calibrations
         `calibration/NAME.json` by scene.
     """
@@ -58,9 +60,11 @@ def map_page(
         stages_section(report.get("stages", ())),
     ]
     lines = list(_verdicts(document, report["summary"], calibrations))
-    begin = [heading("Map", "Map", report.get("engine_version", ""), lines, report["summary"]), _scenes(document)]
+    name = report.get("name", "")
+    kind, title = ("Map", name) if name else ("", "Map")
+    begin = [heading(kind, title, report.get("engine_version", ""), lines, report["summary"]), _scenes(document)]
     room = MOST_BYTES - MARGIN_BYTES - sum(len(part.encode()) for part in (*begin, *others, *_seams(document)))
-    return page("Map", [*begin, *_seams(document, folder, room), *others])
+    return page(f"{name}: map" if name else "Map", [*begin, *_seams(document, folder, room), *others])
 
 
 def _verdicts(

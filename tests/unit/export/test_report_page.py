@@ -222,6 +222,25 @@ def test_a_map_names_its_seams_and_shows_the_calibration_of_each_drive(written: 
 
 
 @pytest.mark.parametrize(
+    ("named", "title", "heading"),
+    [
+        (
+            {"name": "kitti <street>"},
+            "kitti &lt;street&gt;: map",
+            '<p class="kind">Map</p><h1>kitti &lt;street&gt;</h1>',
+        ),
+        ({}, "Map", "<header><h1>Map</h1>"),
+    ],
+)
+def test_a_map_is_titled_by_its_name_and_without_one_as_a_map(
+    tmp_path: Path, named: dict[str, str], title: str, heading: str
+) -> None:
+    found = map_page(map_document(0), tmp_path, REPORT | {"summary": MAP_SUMMARY} | named, {})
+    assert f"<title>{title}</title>" in found
+    assert heading in found
+
+
+@pytest.mark.parametrize(
     ("sigma", "words"),
     [(0.0005312, "1.00213 <small>± 0.00053"), (0.0412, "1.002 <small>± 0.041"), (None, "1.0021"), (0.0, "1.0021")],
 )
