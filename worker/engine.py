@@ -21,7 +21,7 @@ from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.preflight.image_content import inspect_drive
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage, drive_of_scene
-from schemas.findings import as_json, error
+from schemas.findings import Finding, as_json, error, warning
 from worker.child_protocol import ChildError, ChildRequest, ChildResult, SubmapPlan, Work
 from worker.engine_settings import engine_config
 from worker.progress_pipe import ProgressWriter
@@ -128,6 +128,7 @@ def _aggregate(
             for found in report.pop("left_out")
         ]
         report["failed_drives"] = [*request.failed, *unfit]
+        report["findings"][:0] = [as_json(_left_out(drive)) for drive in request.failed]  # of others the engine has one
 
     aggregate(
         request.scenes,
@@ -148,6 +149,12 @@ def _aggregate(
 def _member(request: ChildRequest, name: str) -> Mapping[str, Any]:
     """The drive that a scene, or a component, was made of."""
     return request.members[name] if name in request.members else request.members[drive_of_scene(name)]
+
+
+def _left_out(drive: Mapping[str, Any]) -> Finding:
+    """Finding on a drive that has no scene."""
+    problem = drive["problem"]
+    return warning("drive-left-out", f"drive {drive['name']} is not in the map: {problem['detail']}", problem["remedy"])
 
 
 def _problem(found: dict[str, Any]) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import shutil
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -79,15 +80,32 @@ def paths(world: World, number: int) -> set[str]:
 
 
 @pytest.mark.slow
-def test_a_map_is_titled_by_its_name(unpowered: World, tmp_path: Path) -> None:
-    ids = [scene_of_example(unpowered, tmp_path, name) for name in ("a", "b")]
-    job, due = ask(unpowered, scenes=ids, name="kitti street")
-    run(unpowered, *due)
-    assert unpowered.job(job.id).state == "SUCCEEDED", unpowered.job(job.id).problem
-    assert document(unpowered, 1, "report.json")["name"] == "kitti street"
-    page = stored(unpowered, 1, "report.html").decode()
+def test_a_map_is_titled_by_its_name_and_a_drive_that_failed_is_a_finding(unpowered: World, tmp_path: Path) -> None:
+    world = unpowered
+    ids = [scene_of_example(world, tmp_path, name) for name in ("a", "b")]
+    failing = world.add_drive(named_drive(tmp_path, "b_size"))
+    job, (child,) = ask(world, scenes=ids, drives=[failing], name="kitti street")
+    run(world, child, job)
+    assert (world.job(child.id).state, world.job(job.id).state) == ("FAILED", "SUCCEEDED"), world.job(job.id).problem
+    problem = world.job(child.id).problem
+    assert problem is not None
+    report, page = document(world, 1, "report.json"), stored(world, 1, "report.html").decode()
+    assert report["name"] == "kitti street"
     assert "<title>kitti street: map</title>" in page
     assert '<p class="kind">Map</p><h1>kitti street</h1>' in page
+
+    assert report["findings"][0] == {
+        "severity": "warning",
+        "code": "drive-left-out",
+        "what": f"drive b_size is not in the map: {problem['detail']}",
+        "remedy": problem["remedy"],
+    }
+    codes = [finding["code"] for finding in report["findings"]]
+    assert codes.count("drive-left-out") == len(report["failed_drives"]) == 1
+    (version,) = versions(world)
+    assert version.summary["warnings"] == len(codes)
+    assert "1 drive is not in the map: b_size" in page
+    assert f"drive b_size is not in the map: {escape(problem['detail'])}" in page
 
 
 @pytest.mark.slow
@@ -220,7 +238,14 @@ def test_a_scene_that_fits_into_no_map_is_left_out(unpowered: World, two_drives:
     (failed,) = version.failed
     assert (failed["name"], failed["drive_id"], failed["job_id"]) == ("indoors", ids[2], due[2].id)
     assert failed["problem"]["type"].endswith("not-georeferenced")
-    assert document(world, 1, "report.json")["failed_drives"] == version.failed
+    report = document(world, 1, "report.json")
+    assert report["failed_drives"] == version.failed
+    codes = [finding["code"] for finding in report["findings"]]
+    assert "scene-left-out" in codes
+    assert "drive-left-out" not in codes, "one finding for each drive"
+    page = stored(world, 1, "report.html").decode()
+    assert page.count("indoors is not in the map") == 1
+    assert "not in the map: indoors" not in page
     assert len(document(world, 1, "map.json")["scenes"]) == version.summary["scenes"] == 2
 
     job, due = ask(world, drives=ids, require_all=True)

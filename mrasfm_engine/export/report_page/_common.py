@@ -43,6 +43,11 @@ def share_verdict(summary: Mapping[str, Any], what: str) -> str:
     return verdict(kind, f"{number(registered)} of {number(total)} {what} have a pose")
 
 
+def findings_verdict(findings: Sequence[Any]) -> str:
+    """Verdict that there are findings."""
+    return verdict("warn", f"{number(len(findings))} finding{'s' if len(findings) > 1 else ''}, see below")
+
+
 def heading(kind: str, name: str, version: object, lines: Sequence[str], summary: Mapping[str, Any]) -> str:
     """Title, verdicts and figures; without a line for the kind where that is empty."""
     above = f'<p class="kind">{text(kind)}</p>' if kind else ""

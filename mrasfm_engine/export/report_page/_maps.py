@@ -7,7 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from mrasfm_engine.export.report_page._calibration import map_calibration_sections, wrong_cameras
-from mrasfm_engine.export.report_page._common import findings_section, heading, share_verdict, stages_section, verdict
+from mrasfm_engine.export.report_page._common import (
+    findings_section,
+    findings_verdict,
+    heading,
+    share_verdict,
+    stages_section,
+    verdict,
+)
 from mrasfm_engine.export.report_page._html import (
     PREVIEW_BYTES,
     facts,
@@ -20,6 +27,7 @@ from mrasfm_engine.export.report_page._html import (
     text,
 )
 from mrasfm_engine.export.report_page._read_back import MOST_BYTES
+from schemas.findings import listed
 
 # Below this nothing is seen on it; the pictures of seams for which there is no room are named.
 SMALLEST_PICTURE_BYTES = 12_000
@@ -32,6 +40,7 @@ SEAM_FIGURES = (
     ("sigma_translation_m", "Sigma of the translation", "m"),
     ("sigma_rotation_deg", "Sigma of the rotation", "deg"),
 )
+MOST_NAMED = 12  # of the drives that are not in the map
 SCALE_DIGITS = 5  # where its sigma is not known
 
 
@@ -59,7 +68,7 @@ def map_page(
         findings_section(report.get("findings", ())),
         stages_section(report.get("stages", ())),
     ]
-    lines = list(_verdicts(document, report["summary"], calibrations))
+    lines = list(_verdicts(document, report, calibrations))
     name = report.get("name", "")
     kind, title = ("Map", name) if name else ("", "Map")
     begin = [heading(kind, title, report.get("engine_version", ""), lines, report["summary"]), _scenes(document)]
@@ -68,24 +77,31 @@ def map_page(
 
 
 def _verdicts(
-    document: Mapping[str, Any], summary: Mapping[str, Any], calibrations: Mapping[str, Mapping[str, Any]]
+    document: Mapping[str, Any], report: Mapping[str, Any], calibrations: Mapping[str, Mapping[str, Any]]
 ) -> Iterator[str]:
     scenes, unconnected = document["scenes"], document["unconnected"]
     connected = len(scenes) - len(unconnected)
     yield verdict(
         "warn" if unconnected else "good", f"{number(connected)} of {number(len(scenes))} scenes are connected"
     )
-    yield share_verdict(summary, "images")
+    yield share_verdict(report["summary"], "images")
     wrong = {name: cameras for name, one in calibrations.items() if (cameras := wrong_cameras(one))}
     if wrong:
         named = "; ".join(f"{', '.join(cameras)} in {name}" for name, cameras in wrong.items())
         yield verdict("bad", f"not mounted as given: {text(named)}")
     elif calibrations:
         yield verdict("good", "no camera contradicts its calibration")
+    fit_nowhere = {scene["name"] for scene in document["left_out"]}
+    failed = [name for drive in report.get("failed_drives", ()) if (name := drive["name"]) not in fit_nowhere]
+    if failed:
+        drives = "1 drive is" if len(failed) == 1 else f"{number(len(failed))} drives are"
+        yield verdict("bad", f"{drives} not in the map: {text(listed(failed, MOST_NAMED))}")
     if document["left_out"]:
         yield verdict("bad", f"{number(len(document['left_out']))} scenes are left out: nothing places them")
     if document["loops"]:
         yield verdict("warn", f"{number(len(document['loops']))} loops of seams do not close")
+    if report.get("findings"):
+        yield findings_verdict(report["findings"])
 
 
 def _scenes(document: Mapping[str, Any]) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from mrasfm_engine.export.report_page._calibration import calibration_sections
 from mrasfm_engine.export.report_page._common import (
     findings_section,
+    findings_verdict,
     heading,
     share_verdict,
     stage_of,
@@ -84,7 +85,7 @@ def _verdicts(
     if sigma is not None:
         yield verdict("good" if sigma < 0.02 else "warn", f"sigma of the scale {number(100 * sigma, '%')}")
     if findings:
-        yield verdict("warn", f"{number(len(findings))} finding{'s' if len(findings) > 1 else ''}, see below")
+        yield findings_verdict(findings)
 
 
 def _pictures(folder: Path) -> str:

@@ -240,6 +240,16 @@ def test_a_map_is_titled_by_its_name_and_without_one_as_a_map(
     assert heading in found
 
 
+def test_a_map_names_the_drives_that_are_not_in_it_once(tmp_path: Path) -> None:
+    document = map_document(0) | {"left_out": [{"name": "three", "reason": "no seam places it"}]}
+    report = REPORT | {"summary": MAP_SUMMARY, "failed_drives": [{"name": "b<size"}, {"name": "three"}]}
+    found = map_page(document, tmp_path, report, {})
+    assert "1 drive is not in the map: b&lt;size" in found
+    assert found.count("not in the map") == 1
+    assert "</span> finding, see below" in found
+    assert "finding, see below" not in map_page(document, tmp_path, report | {"findings": []}, {})
+
+
 @pytest.mark.parametrize(
     ("sigma", "words"),
     [(0.0005312, "1.00213 <small>± 0.00053"), (0.0412, "1.002 <small>± 0.041"), (None, "1.0021"), (0.0, "1.0021")],
