@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from enum import StrEnum
+from typing import Any
 
 
 class Stage(StrEnum):
@@ -102,6 +104,13 @@ def seam_name(a: str, b: str) -> str:
 def seam_checkpoint(a: str, b: str) -> str:
     """Name the checkpoint of a seam."""
     return f"seam-{seam_name(a, b)}"
+
+
+def road_not_drawn(report: Mapping[str, Any]) -> str | None:
+    """The reason that a scene's report gives for having no picture of its road; None where it gives none."""
+    drawn = [stage for stage in report.get("stages", ()) if stage.get("stage") == Stage.PICTURES]
+    reasons = (stage.get(picture, {}).get("not_drawn") for stage in drawn for picture in ("road", "birds_eye"))
+    return next((str(reason) for reason in reasons if reason), None)
 
 
 def is_read_by_aggregation(path: str) -> bool:

@@ -382,6 +382,8 @@ class ComponentUnknown(ServiceError, status=422):
 class FilesMissing(ServiceError, status=422):
     """The result lacks files that exports read."""
 
+    report_key: str | None = None  # of the stored report that may give the reason
+
 
 class BadCrs(ServiceError, status=422):
     """No such projected coordinate reference system."""

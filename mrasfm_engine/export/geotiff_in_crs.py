@@ -25,8 +25,9 @@ from mrasfm_engine.export.projection_readback import projected
 from mrasfm_engine.geometry import utm
 from mrasfm_engine.geometry.earth_system import EarthSystem, named_system
 from mrasfm_engine.io import tiff
+from mrasfm_engine.io.read_scene import read_json
 from mrasfm_engine.types import Floats, Ints
-from schemas.artifacts import ROAD_TIFF_FILE
+from schemas.artifacts import REPORT_FILE, ROAD_TIFF_FILE, road_not_drawn
 
 FILE = "road.tif"
 WIDTH, TILE_SIDE = 256, 322  # tags
@@ -123,8 +124,11 @@ def placed_picture(source: ExportSource, options: ExportOptions) -> PlacedPictur
 def _picture(source: ExportSource) -> Picture:
     path = source.folder / ROAD_TIFF_FILE
     if not path.is_file():
+        reason = road_not_drawn(
+            read_json(source.folder / REPORT_FILE, remedy="Copy or download it again, or make it anew.")
+        )
         raise InputError(
-            f"{source.folder} has no {ROAD_TIFF_FILE}",
+            f"{source.folder} has no {ROAD_TIFF_FILE}" + (f": {reason}" if reason else ""),
             remedy="Leave the format out: maps, and scenes whose pictures were not drawn, have no picture of a road.",
             code="no-picture",
         )

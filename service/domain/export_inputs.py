@@ -13,7 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportRequest
-from schemas.artifacts import ROAD_TIFF_FILE, component_folder
+from schemas.artifacts import REPORT_FILE, ROAD_TIFF_FILE, component_folder
 from schemas.exports import EXPORT_FORMATS, EXPORTED_OF_MAP, EXPORTED_OF_SCENE, is_read_by_export
 from service.database.tables import Blob, Drive, Export, MapFile, MapScene, MapVersion, Scene, SceneFile
 from service.domain.map_inputs import StoredArtifact
@@ -176,8 +176,8 @@ class ExportInputs:
 
     def _require_files(self, session: Session) -> None:
         read = EXPORTED_OF_SCENE if isinstance(self.subject, Scene) else EXPORTED_OF_MAP
-        there = {file.path for file in self.files(session)}
-        missing = sorted(read - there)
+        there = {file.path: file.key for file in self.files(session)}
+        missing = sorted(read - there.keys())
         if missing:
             raise FilesMissing(
                 f"{self.name} has no {missing[0]}, which exports read",
@@ -185,10 +185,15 @@ class ExportInputs:
             )
         needing = [name for name in self.formats if EXPORT_FORMATS[name].needs_picture]
         if needing and ROAD_TIFF_FILE not in there:
-            raise FilesMissing(
+            whole = isinstance(self.subject, Scene) and self.component is None
+            refusal = FilesMissing(
                 f"{self.name} has no picture of the road, which format {needing[0]} is made of",
-                remedy="Leave the format out; a scene has the picture where the setting output.pictures is on.",
+                remedy="Leave the format out; a scene has the picture where the setting output.pictures is on."
+                if whole
+                else "Leave the format out: maps and smaller components of a scene never have the picture.",
             )
+            refusal.report_key = there[REPORT_FILE] if whole else None
+            raise refusal
 
 
 def drive_deleted(drive_id: str) -> DriveDeleted:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from typing import Any
 
 import pytest
@@ -52,6 +53,31 @@ def publish(client: Client, job_id: str, results: list[dict[str, Any]] = RESULTS
     held = client.claim(job_id)
     with client.api.database.write() as session:
         exports.publish(session, held, files=stored, results=results, expires_us=None)
+
+
+@pytest.mark.parametrize(
+    ("report", "reason", "remedy"),
+    [
+        (
+            {"stages": [{"stage": "pictures", "birds_eye": {"not_drawn": "too few points lie on the ground"}}]},
+            ": too few points lie on the ground",
+            "reconstruct the drive again",
+        ),
+        ({"stages": [{"stage": "pictures", "birds_eye": {}, "road": {"not_drawn": "a"}}]}, ": a", "Leave the format"),
+        ({"stages": [{"stage": "mapping"}]}, "is made of", "output.pictures is on"),
+        (["no report"], "is made of", "output.pictures is on"),
+    ],
+)
+def test_a_picture_that_is_missing_is_refused_with_the_scenes_own_reason(
+    client: Client, monkeypatch: pytest.MonkeyPatch, report: object, reason: str, remedy: str
+) -> None:
+    monkeypatch.setattr(live_api, "SUMMARY", live_api.SUMMARY.model_copy(update={"georeferenced": True}))
+    scene_id = client.scene({**SCENE_FILES, "report.json": json.dumps(report).encode()})
+    answer = client.post(f"/v1/scenes/{scene_id}/exports", json={"formats": ["geotiff"]})
+    problem = problem_of(answer, 422, "files-missing")
+    assert problem["detail"].startswith(f"scene {scene_id} has no picture of the road, which format geotiff is made of")
+    assert problem["detail"].endswith(reason)
+    assert remedy in problem["remedy"]
 
 
 def test_an_export_from_the_request_to_the_download(client: Client, scene_id: str) -> None:

@@ -32,7 +32,7 @@ from mrasfm_engine.export.report_page._html import (
     text,
 )
 from mrasfm_engine.scene.scene import Scene
-from schemas.artifacts import PICTURES_FOLDER, Stage
+from schemas.artifacts import PICTURES_FOLDER, Stage, road_not_drawn
 
 MOST_NAMED = 12
 
@@ -55,7 +55,7 @@ def scene_page(scene: Scene, folder: Path, report: Mapping[str, Any], calibratio
         f"{name}: scene",
         [
             heading("Scene", name, report.get("engine_version", ""), lines, summary),
-            _pictures(folder / PICTURES_FOLDER),
+            _pictures(folder / PICTURES_FOLDER, road_not_drawn(report)),
             calibration_sections(calibration),
             _residuals(camera_residuals(scene)),
             _gnss(scene, refinement),
@@ -88,7 +88,7 @@ def _verdicts(
         yield findings_verdict(findings)
 
 
-def _pictures(folder: Path) -> str:
+def _pictures(folder: Path, reason: str | None) -> str:
     ground = pair(
         folder,
         "birds_eye_before.png",
@@ -105,7 +105,8 @@ def _pictures(folder: Path) -> str:
             "Points of the road, before and after points off its surface were dropped",
         )
     )
-    return section("Before and after", ground, road) or section(
+    why = f"<p>The picture of the road from above is not drawn: {text(reason)}.</p>\n" if reason else ""
+    return section("Before and after", ground, road, why) or section(
         "Before and after", "<p>There are no pictures: they were switched off, or no ground is seen.</p>\n"
     )
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
+from obstore.exceptions import BaseError as StoreError
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from schemas.api.exports import ExportFileResource, ExportRequest, ExportResource
 from schemas.api.jobs import JobState
 from schemas.api.resource import Page
+from schemas.artifacts import road_not_drawn
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer, expiry_us, moment
 from service.api.http.body_reading import json_body
@@ -24,6 +27,7 @@ from service.database.tables import Blob, Export, ExportFile, Job, MapVersion, S
 from service.domain import exports, maps
 from service.domain.access import require
 from service.domain.idempotency import Answer
+from service.errors import FilesMissing
 from service.settings import Settings
 from service.storage.named_blobs import Named
 
@@ -58,7 +62,17 @@ def create_scene_export(
         scene = require(session, Scene, caller.project_id, scene_id, lock=True)
         return _asked(session, context, caller.project_id, scene, body.value)
 
-    return once(effect, body.raw)
+    try:
+        return once(effect, body.raw)
+    except FilesMissing as missing:
+        # After the transaction: a store that does not answer must hold no lock.
+        reason = _reason_in_report(context, missing.report_key)
+        if reason is None:
+            raise
+        raise FilesMissing(
+            f"{missing.problem.detail}: {reason}",
+            remedy="Leave the format out, or correct what the reason names and reconstruct the drive again.",
+        ) from None
 
 
 @router.post(
@@ -160,6 +174,14 @@ async def download_export_file(
         return export_id, *find_file(session, ExportFile, mine, path, owner=f"export {export_id}")
 
     return await send_file(context, request, path, find)
+
+
+def _reason_in_report(context: Context, key: str | None) -> str | None:
+    """The reason in a stored report for a picture that was not drawn; None without a readable one."""
+    try:
+        return None if key is None else road_not_drawn(json.loads(context.artifacts.read(key)))
+    except (OSError, StoreError, ValueError, LookupError, TypeError, AttributeError):
+        return None
 
 
 def _asked(

@@ -119,6 +119,14 @@ def test_a_wrong_camera_is_flagged_and_no_other(tmp_path: Path) -> None:
     assert {row["data-camera"] for row in rows if row.get("class") == "wrong"} == {"right"}
 
 
+def test_the_reason_for_a_missing_picture_is_shown(tmp_path: Path) -> None:
+    stage = {"stage": "pictures", "seconds": 0.1, "birds_eye": {"not_drawn": "too few points <lie> on the ground"}}
+    write_scene(make_scene(), tmp_path / "scene", REPORT | {"stages": [stage]})
+    page = (tmp_path / "scene" / REPORT_PAGE).read_text()
+    assert "The picture of the road from above is not drawn: too few points &lt;lie&gt; on the ground." in page
+    assert "they were switched off" not in page
+
+
 def test_residuals_are_those_of_the_scene() -> None:
     scene = make_scene()
     scene.point_error_px[:] = 0.0  # points are projected exactly
