@@ -199,10 +199,15 @@ class Client:
         return self._get(f"/v1/jobs/{_part(job_id)}", JobResource)
 
     def jobs(
-        self, *, drive_id: str | None = None, states: Iterable[JobState] = (), kinds: Iterable[JobKind] = ()
+        self,
+        *,
+        drive_id: str | None = None,
+        states: Iterable[JobState] | JobState = (),
+        kinds: Iterable[JobKind] | JobKind = (),
     ) -> Iterator[JobResource]:
         """All jobs of the project, newest first; of one drive, some states or kinds alone where these are given."""
-        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id, state=[*states], kind=[*kinds])
+        state, kind = ([one] if isinstance(one, str) else [*one] for one in (states, kinds))  # each member is a string
+        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id, state=state, kind=kind)
 
     def poll_job(self, job_id: str, etag: str | None) -> tuple[JobResource | None, str | None, float]:
         """A job, if it has changed since it had this ETag.

@@ -15,7 +15,7 @@ import pytest
 from sqlalchemy import delete
 
 from schemas.api.exports import ExportRequest
-from schemas.api.jobs import JobState
+from schemas.api.jobs import JobKind, JobState
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from schemas.api.webhooks import WebhookEvent, WebhookRequest
 from service.client import ApiError, AsyncClient, Client, ClientError, download, watch_job
@@ -59,6 +59,9 @@ def test_scenes_maps_and_jobs(client: Owner, connect: Connect) -> None:
     library.cancel_job(job["id"])
     again = library.retry_job(job["id"])
     assert again.retry_of == job["id"]
+    assert [found.id for found in library.jobs(states=JobState.CANCELLED)] == [job["id"]]
+    both = library.jobs(states=[JobState.CANCELLED, JobState.QUEUED], kinds=JobKind.AGGREGATION)
+    assert [found.id for found in both] == [again.id, job["id"]]
     client.publish_map(client.claim(again.id), {"map.json": b"{}"})
     assert again.map_id is not None
     assert library.map(again.map_id).current_version == 1
