@@ -227,9 +227,10 @@ def _cancel(conversation: Conversation, summary: Summary) -> int:
 
 
 def _retry(conversation: Conversation, summary: Summary) -> int:
-    made = [conversation.client.retry_job(job_id) for job_id in conversation.arguments.ids]
-    for job in made:
-        _note(conversation, summary, job)
+    made = []
+    for job_id in conversation.arguments.ids:
+        made.append(conversation.client.retry_job(job_id))
+        _note(conversation, summary, made[-1])  # also where the next one is refused
     return max(_ended(conversation, job.id) for job in made) if conversation.arguments.wait else 0
 
 

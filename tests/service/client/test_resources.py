@@ -180,6 +180,8 @@ def test_a_list_of_jobs_says_which_drive_and_why(
     assert main(["cancel", runs, waits]) == 0
     assert main(["list", "jobs", "--limit", "1"]) == 0
     assert capsys.readouterr().out.strip().endswith(f"retry of {failed}")
+    assert main(["retry", waits, "job_0"]) == 2
+    assert f"{client.api.url}/v1/jobs/" in capsys.readouterr().err, "the first was made, whatever becomes of the next"
     with pytest.raises(SystemExit):
         main(["list", "jobs", "--limit", "0"])
     monkeypatch.delenv("MRASFM_URL")
