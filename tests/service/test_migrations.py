@@ -6,7 +6,8 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -75,11 +76,8 @@ def test_a_migration_that_waits_for_a_table_lets_others_have_it(
     monkeypatch.setattr(connections, "TABLE_LOCK_S", 0.3)
     monkeypatch.setattr(connections, "PAUSE_S", 0.2)
     settings = Settings(database_url=postgres_database)
-    database = Database.from_settings(settings)
-    _upgrade(database, "0013")
     waiting = threading.Thread(target=migrate, args=(settings,))
-    with database.engine.connect() as user, user.begin():
-        user.execute(text("SELECT count(*) FROM jobs"))
+    with _jobs_in_use(settings) as database:
         waiting.start()
         wait_until(lambda: _waits_for_a_lock(database), "the migration waits for the table")
         with database.engine.connect() as reader, reader.begin():
@@ -87,6 +85,7 @@ def test_a_migration_that_waits_for_a_table_lets_others_have_it(
             reader.execute(text("SELECT count(*) FROM jobs"))
         assert not is_current(database)
     waiting.join(60.0)
+    database = Database.from_settings(settings)
     assert is_current(database)
     assert differences(database) == []
     database.close()
@@ -99,12 +98,22 @@ def test_a_migration_that_gets_no_table_says_what_to_do(
     monkeypatch.setattr(connections, "PAUSE_S", 0.0)
     monkeypatch.setattr(connections, "MAX_MIGRATION_ATTEMPTS", 2)
     settings = Settings(database_url=postgres_database)
+    with (
+        _jobs_in_use(settings),
+        pytest.raises(UnusableDatabaseError, match="pg_stat_activity"),
+        unusable_is_told(settings),
+    ):
+        migrate(settings)
+
+
+@contextmanager
+def _jobs_in_use(settings: Settings) -> Iterator[Database]:
+    """A database of an older version, one of whose tables a transaction has read that goes on."""
     database = Database.from_settings(settings)
     _upgrade(database, "0013")
     with database.engine.connect() as user, user.begin():
         user.execute(text("SELECT count(*) FROM jobs"))
-        with pytest.raises(UnusableDatabaseError, match="pg_stat_activity"), unusable_is_told(settings):
-            migrate(settings)
+        yield database
     database.close()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mrasfm_engine.export.report_page._html import decimals_of, exact, section, shown, table, text
+from mrasfm_engine.export.report_page._html import exact, number_with_sigma, section, shown, table, text
 
 AXES = ("x", "y", "z")
 SIGMA_DIGITS, INTRINSIC_DIGITS = 3, 6
@@ -96,11 +96,7 @@ def _corrections(cameras: Mapping[str, Any], what: str, field: str, unit: str, s
 def _value(value: float, sigma: float | None, axis: str) -> str:
     if sigma is None or sigma <= 0:
         return f'<span class="n" data-axis="{axis}" data-value="{exact(value)}">{shown(value, SIGMA_DIGITS)}</span>'
-    decimals = decimals_of(sigma, SIGMA_DIGITS)
-    return (
-        f'<span class="n" data-axis="{axis}" data-value="{exact(value)}" data-sigma="{exact(sigma)}">'
-        f"{value:.{decimals}f} <small>± {sigma:.{decimals}f}</small></span>"
-    )
+    return number_with_sigma(value, sigma, digits=SIGMA_DIGITS, attributes=f'data-axis="{axis}"')
 
 
 def _verdicts(words: Sequence[str]) -> str:

@@ -72,11 +72,11 @@ def number(value: float, unit: str = "", digits: int = 3) -> str:
     return f'<span class="n" data-value="{exact(value)}">{shown(value, digits)}</span>{_unit(unit)}'
 
 
-def number_with_sigma(value: float, sigma: float, *, digits: int = 2) -> str:
+def number_with_sigma(value: float, sigma: float, *, digits: int = 2, attributes: str = "") -> str:
     """A number and its sigma with the decimals that show so many significant digits of the sigma."""
     decimals = decimals_of(sigma, digits)
     return (
-        f'<span class="n" data-value="{exact(value)}" data-sigma="{exact(sigma)}">'
+        f'<span class="n" {attributes} data-value="{exact(value)}" data-sigma="{exact(sigma)}">'
         f"{value:.{decimals}f} <small>± {sigma:.{decimals}f}</small></span>"
     )
 
