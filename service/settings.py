@@ -19,7 +19,6 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL
 
 # Numbers have both bounds: what does not fit the database's integers, or a date, would fail at the first request.
-DATABASE_FILE = "mrasfm.sqlite3"  # in the data folder
 _MAX_BYTES = 2**60
 Bytes = Annotated[int, Field(ge=1, le=_MAX_BYTES)]
 Hours = Annotated[float, Field(gt=0, le=24 * 365, allow_inf_nan=False)]
@@ -214,7 +213,7 @@ class Settings(BaseSettings):
     @property
     def database_file(self) -> Path:
         """The database of a service that keeps all its state in the data folder."""
-        return self.data_dir.resolve() / DATABASE_FILE
+        return self.data_dir.resolve() / "mrasfm.sqlite3"
 
     @property
     def resolved_database_url(self) -> str:

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from schemas.artifacts import CHECKPOINT_FOLDER
 from schemas.file_names import is_ignored
-from service.settings import DATABASE_FILE
 
 LOCK_FILE = "standalone.lock"
+DATABASE_FILE = "mrasfm.sqlite3"
 # Folders of the state, which may have been restored without the other files, and that of a new disk.
 FOLDERS = frozenset(
     {"artifacts", "broker", "logs", "lost+found", "metrics", "scratch", "spool", "temporary", "uploads"}

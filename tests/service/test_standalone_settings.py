@@ -16,10 +16,10 @@ import pytest
 
 from service.commands import standalone as command
 from service.database.connections import migrate
-from service.settings import DATABASE_FILE, Settings
+from service.settings import Settings
 from service.standalone import broker
 from service.standalone.program import child_specs
-from service.storage.data_folder import FOLDERS, LOCK_FILE, DataFolderError, require_data_folder
+from service.storage.data_folder import DATABASE_FILE, FOLDERS, LOCK_FILE, DataFolderError, require_data_folder
 
 
 def run(*arguments: str) -> int:
