@@ -16,6 +16,7 @@ setup: .venv/.done ## a virtual environment in .venv with the mrasfm command
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --require-hashes -r requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	$(BIN)/python -m compileall -q mrasfm_engine schemas service worker  # else every start does, if PYTHONDONTWRITEBYTECODE is set
 	@touch $@
 
 demo: setup ## render two drives of a street, get their scenes and the map of both through the service, compare with the truth
