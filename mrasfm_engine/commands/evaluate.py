@@ -24,6 +24,8 @@ def register(subparsers: Any) -> None:
     """Add the `evaluate` parser."""
     parser = subparsers.add_parser(
         "evaluate",
+        # argparse would put OUT last, where the option's files take it for one of theirs
+        usage="%(prog)s [-h] OUT --truth FILE [FILE ...] [--json]",
         help="compare a scene's or map's trajectory with the truth",
         description="Compare the trajectory of a scene or a map with true poses: errors before and after "
         "alignment, and the errors of a map's seams.",
