@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from mrasfm_engine.errors import InputError
 from schemas.drive import MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
 from schemas.findings import enumerated
 from schemas.methods import ExtractorName, MatcherName
+from schemas.misspelt import correction_of
 from schemas.parsing import MAX_PROBLEMS_SHOWN
 
 # The squares of numbers beyond these, and their inverses, leave what float64 can hold to equations.
@@ -352,8 +354,15 @@ class EngineConfig(_Section):
 
 def described(error: ValidationError) -> str:
     """Describe settings that are unknown or out of range: all, up to a number that a screen has room for."""
-    told = [f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors(include_url=False)]
-    return enumerated(told, MAX_PROBLEMS_SHOWN)
+    found = error.errors(include_url=False)
+    told = [f"{'.'.join(map(str, p['loc']))}: {_problem(p)}" for p in found[:MAX_PROBLEMS_SHOWN]]
+    return enumerated(told, MAX_PROBLEMS_SHOWN, count=len(found))
+
+
+def _problem(detail: ErrorDetails) -> str:
+    if detail["type"] == "extra_forbidden":
+        return f"is not a setting{correction_of(EngineConfig, detail['loc'])}"
+    return detail["msg"]
 
 
 def read_config(path: Path | None, **overrides: Any) -> EngineConfig:

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ValidationError
 from schemas.drive import MIN_SIGMA, DriveManifest
 from schemas.file_names import name_problems
 from schemas.findings import enumerated
+from schemas.misspelt import correction_of
 from schemas.patterns import MISMATCH
 
 MAX_MANIFEST_BYTES = 200_000_000  # a day's drive of 6 cameras with 100 Hz GNSS has about 100 MB
@@ -146,7 +147,7 @@ def parse_document(
         read = model.model_validate_json(raw.removeprefix(b"\xef\xbb\xbf"), strict=strict)
     except ValidationError as error:
         details = error.errors(include_url=False, include_context=False)
-        problems = [*found, *(_problem(dict(detail)) for detail in details[:MAX_PROBLEMS])]
+        problems = [*found, *(_problem(dict(detail), model) for detail in details[:MAX_PROBLEMS])]
         raise DocumentError(problems[:MAX_PROBLEMS], count=len(found) + len(details)) from None
     if found:
         raise DocumentError(found)
@@ -213,14 +214,14 @@ def _refuse_constant(name: str) -> Never:
     raise DocumentError([FieldProblem("", f"holds {name}, which is not a JSON number")])
 
 
-def _problem(detail: dict[str, Any]) -> FieldProblem:
+def _problem(detail: dict[str, Any], model: type[BaseModel]) -> FieldProblem:
     path = ".".join(str(part) for part in detail["loc"])
     what = str(detail["msg"]).removeprefix("Value error, ")
     kind = detail["type"]
     if kind == "missing":
         what = "is missing"
     elif kind == "extra_forbidden":
-        what = "is not a field of this document"
+        what = f"is not a field of this document{correction_of(model, detail['loc'])}"
     elif kind == "finite_number":
         what = "must be a finite number"
     elif path.endswith("latitude_deg") and kind in ("less_than_equal", "greater_than_equal"):

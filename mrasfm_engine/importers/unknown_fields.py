@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from difflib import get_close_matches
 
 from schemas.findings import listed
+from schemas.misspelt import similar_name
 
 # Fields in which a calibration says where it comes from.
 COMMENTS = frozenset({"body_frame", "comment", "comments", "description", "name", "notes", "source"})
@@ -37,6 +37,5 @@ def _with_match(name: str, known: Collection[str]) -> str:
     shown = name if len(name) <= MAX_CHARACTERS else name[:MAX_CHARACTERS] + "..."
     if name.lower() in _DISTORTION:
         return shown  # no single field stands for it
-    near = get_close_matches(name[:MAX_CHARACTERS].lower(), {field.lower() for field in known}, 1)
-    match = next((field for field in known if near and field.lower() == near[0]), None)
+    match = similar_name(name, known)
     return shown if match is None else f"{shown} (is it {match}?)"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from difflib import get_close_matches
 
 from fastapi import Request
 from fastapi.dependencies.models import Dependant
@@ -11,6 +10,7 @@ from fastapi.routing import APIRoute
 
 from schemas.api.problems import ProblemItem
 from schemas.findings import enumerated
+from schemas.misspelt import similar_name
 from service.errors import InvalidRequest
 
 _MAX_NAMED = 10
@@ -51,7 +51,7 @@ def _declared(dependant: Dependant) -> Iterator[str]:
 
 
 def _described(name: str, known: list[str]) -> str:
-    similar = get_close_matches(name[:_MAX_NAME_SHOWN], known, n=1)
-    if similar:
-        return f"is no parameter of this request; did you mean {similar[0]!r}?"
+    similar = similar_name(name, known)
+    if similar is not None:
+        return f"is no parameter of this request; did you mean {similar!r}?"
     return f"is no parameter of this request, which takes {', '.join(known) or 'none'}"
