@@ -65,6 +65,8 @@ class DriveResource(Times):
                     "files_stored": 12,
                     "bytes_stored": 18874368,
                     "preflight": "NONE",
+                    "preflight_errors": 0,
+                    "preflight_warnings": 0,
                     "preflight_job_id": None,
                     "created_at": "2026-05-04T09:30:00Z",
                     "committed_at": None,
@@ -85,6 +87,8 @@ class DriveResource(Times):
     files_stored: int = Field(description="of them, those whose bytes are here")
     bytes_stored: int = Field(description="of these files")
     preflight: PreflightState = Field(description=_PREFLIGHT_STATES)
+    preflight_errors: int = Field(description="errors among the findings of the check, so far while it is PENDING")
+    preflight_warnings: int = Field(description="warnings among these findings")
     preflight_job_id: str | None = Field(None, description="the job that checks the images; null before the commit")
     committed_at: datetime | None = Field(None, description="null while it is open")
 

@@ -10,6 +10,7 @@
 What can go wrong is a `ClientError`: an `ApiError` carries the problem that the service answered with.
 """
 
+from schemas.api.drives import PreflightState
 from schemas.api.jobs import JobKind, JobState
 from service.client.api import Client, JobEvent, Result
 from service.client.async_client import AsyncClient
@@ -35,6 +36,7 @@ __all__ = [
     "JobNews",
     "JobState",
     "LocalFile",
+    "PreflightState",
     "Result",
     "SceneFolderError",
     "Sent",

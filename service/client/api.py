@@ -15,7 +15,7 @@ import httpx
 from pydantic import BaseModel, ValidationError
 
 from schemas.api.aggregations import AggregationRequest
-from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource
+from schemas.api.drives import DeclaredFiles, DriveFileResource, DriveResource, PreflightResource, PreflightState
 from schemas.api.exports import ExportFileResource, ExportRequest, ExportResource
 from schemas.api.jobs import JobKind, JobResource, JobState, ReconstructionSettings
 from schemas.api.maps import MapFileResource, MapResource, MapVersionResource
@@ -142,9 +142,11 @@ class Client:
         """One drive."""
         return self._get(f"/v1/drives/{_part(drive_id)}", DriveResource)
 
-    def drives(self, *, vehicle: str | None = None) -> Iterator[DriveResource]:
-        """All drives of the project, newest first; of one vehicle alone where that is given."""
-        return self._pages("/v1/drives", Page[DriveResource], vehicle=vehicle)
+    def drives(
+        self, *, vehicle: str | None = None, preflight: Iterable[PreflightState] | PreflightState = ()
+    ) -> Iterator[DriveResource]:
+        """All drives of the project, newest first; of one vehicle or some states of the check where these are given."""
+        return self._pages("/v1/drives", Page[DriveResource], vehicle=vehicle, preflight=_values(preflight))
 
     def delete_drive(self, drive_id: str) -> None:
         """Delete a drive. Its scenes stay."""
@@ -206,8 +208,8 @@ class Client:
         kinds: Iterable[JobKind] | JobKind = (),
     ) -> Iterator[JobResource]:
         """All jobs of the project, newest first; of one drive, some states or kinds alone where these are given."""
-        state, kind = ([one] if isinstance(one, str) else [*one] for one in (states, kinds))  # each member is a string
-        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id, state=state, kind=kind)
+        given = {"state": _values(states), "kind": _values(kinds)}
+        return self._pages("/v1/jobs", Page[JobResource], drive_id=drive_id, **given)
 
     def poll_job(self, job_id: str, etag: str | None) -> tuple[JobResource | None, str | None, float]:
         """A job, if it has changed since it had this ETag.
@@ -458,6 +460,10 @@ def _parsed(response: httpx.Response, model: type[Model]) -> Model:
         return model.model_validate_json(response.content)
     except ValidationError:
         raise unexpected(response, f"a {model.__name__} of this version's service") from None
+
+
+def _values(given: Iterable[str] | str) -> list[str]:
+    return [given] if isinstance(given, str) else [*given]  # a member of an enumeration is a string as well
 
 
 def _lines(pieces: Iterator[bytes]) -> Iterator[str]:

@@ -44,6 +44,8 @@ def register_resources(subparsers: argparse._SubParsersAction[argparse.ArgumentP
                         "such as FAILED; may be repeated")  # fmt: skip
     parser.add_argument("--kind", action="append", dest="kinds", metavar="KIND", help="only jobs of this kind, such as "
                         "RECONSTRUCTION; may be repeated")  # fmt: skip
+    parser.add_argument("--preflight", action="append", metavar="STATE", help="only drives whose check has this state, "
+                        "such as REJECTED; may be repeated")  # fmt: skip
     parser = _command(subparsers, "show", "show a drive, job, scene, map, export or webhook", _show)
     parser.add_argument("id", metavar="ID", help="id as `list` prints it; of a map also MAP/VERSION")
     parser = _command(subparsers, "delete", "delete a drive, scene, map, export or webhook", _delete)
@@ -119,19 +121,28 @@ def _list(conversation: Conversation, summary: Summary) -> int:
 
 
 def _only(arguments: argparse.Namespace) -> dict[str, Any]:
-    """States and kinds of the jobs that are listed."""
+    """States and kinds of the jobs that are listed, states of the check of the drives."""
+    from schemas.api.drives import PreflightState
     from schemas.api.jobs import JobKind, JobState
     from service.client import ClientError
 
-    wanted: tuple[tuple[str, type[StrEnum]], ...] = (("states", JobState), ("kinds", JobKind))
-    given = {name: (getattr(arguments, name), values) for name, values in wanted if getattr(arguments, name)}
-    if given and arguments.what != "jobs":
-        raise ClientError(f"{arguments.what} have no state or kind. Give --state and --kind with `list jobs`.")
-    for name, (words, values) in given.items():
+    filters: tuple[tuple[str, str, str, type[StrEnum]], ...] = (
+        ("states", "state", "jobs", JobState),
+        ("kinds", "kind", "jobs", JobKind),
+        ("preflight", "preflight", "drives", PreflightState),
+    )
+    only = {}
+    for name, option, what, values in filters:
+        words = getattr(arguments, name)
+        if not words:
+            continue
+        if arguments.what != what:
+            raise ClientError(f"{arguments.what} are not listed by --{option}. Give it with `list {what}`.")
         for word in words:
             if word.upper() not in list(values):
-                raise ClientError(f"--{name[:-1]} is {word!r}. Give one of {', '.join(values)}.")
-    return {name: [word.upper() for word in words] for name, (words, _) in given.items()}
+                raise ClientError(f"--{option} is {word!r}. Give one of {', '.join(values)}.")
+        only[name] = [word.upper() for word in words]
+    return only
 
 
 def _deliveries(conversation: Conversation, summary: Summary) -> int:
@@ -146,10 +157,27 @@ def _print(conversation: Conversation, summary: Summary, items: Iterable[BaseMod
         summary.items.append(shown)
         if not conversation.arguments.json:
             words = [str(shown[name]) for name in _SHOWN if shown.get(name) not in (None, "")]
-            print("  ".join([shown["id"], *words, *_of_job(shown)]), flush=True)
+            print("  ".join([shown["id"], *words, *_of_drive(shown), *_of_job(shown)]), flush=True)
     if next(rest, None) is not None:
         conversation.say(f"there are more than these {limit}: --limit lists them")
     return 0
+
+
+def _of_drive(shown: dict[str, Any]) -> list[str]:
+    """Result of the check of a drive with the number of its findings; nothing of another resource."""
+    from schemas.api.drives import PreflightState
+
+    if "preflight_errors" not in shown or shown["preflight"] == PreflightState.NONE:
+        return []
+    found = [(shown["preflight_errors"], "error"), (shown["preflight_warnings"], "warning")]
+    counts = ", ".join(f"{count} {what}{'' if count == 1 else 's'}" for count, what in found if count)
+    match shown["preflight"]:
+        case PreflightState.PENDING:
+            return [f"check runs: {counts} so far" if counts else "check runs"]
+        case PreflightState.UNKNOWN:
+            return [f"check failed: {shown['preflight_job_id']}"]
+        case state:
+            return [f"check {state.lower()}: {counts or 'no finding'}"]
 
 
 def _of_job(shown: dict[str, Any]) -> list[str]:

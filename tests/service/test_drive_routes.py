@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import insert
 
+from schemas.api.drives import PreflightState
 from schemas.api.jobs import JobKind
 from schemas.api.resource import Finding
 from service.api.manifests import manifest_check
@@ -269,12 +270,33 @@ def test_what_the_check_of_the_images_finds_is_shown(client: Client) -> None:
         held = jobs.claim(session, check["job_id"], owner="worker@test", lease_us=60_000_000)
         assert held is not None
         jobs.record_findings(session, held, [finding.model_dump()], sound=False)
+    (listed,) = client.get("/v1/drives").json()["items"]
+    assert (listed["preflight"], listed["preflight_errors"], listed["preflight_warnings"]) == ("REJECTED", 1, 0)
     shown = client.get(f"/v1/drives/{drive_id}/preflight").json()
     assert shown == {"state": "REJECTED", "job_id": check["job_id"], "findings": [finding.model_dump()]}
     answer = client.post("/v1/reconstructions", json={"drive_id": drive_id})
     problem = problem_of(answer, 422, "drive-rejected")
     assert problem["findings"] == [finding.model_dump()]
     assert problem["remedy"] == "Clean the lens."
+
+
+def test_drives_by_the_state_of_their_check(client: Client) -> None:
+    still_open, pending, rejected, passed = client.create(), *(client.committed() for _ in range(3))
+    with client.api.database.write() as session:
+        session.get_one(Drive, rejected).preflight_state = PreflightState.REJECTED
+        session.get_one(Drive, passed).preflight_state = PreflightState.PASSED
+
+    def listed(**query: object) -> list[str]:
+        return [drive["id"] for drive in client.get("/v1/drives", params=query).json()["items"]]
+
+    assert listed(preflight="REJECTED") == [rejected]
+    assert listed(preflight=["PENDING", "PASSED"]) == [passed, pending]
+    assert listed(preflight=["PENDING", "PASSED"], limit=1) == [passed]
+    assert listed(preflight="NONE") == [still_open]
+    assert listed(preflight="UNKNOWN") == []
+    assert len(listed()) == 4
+    assert client.get("/v1/drives", params={"preflight": "rejected"}).status_code == 422
+    assert client.get("/v1/drives", params={"preflight": ["PASSED"] * 6}).status_code == 422
 
 
 def test_a_check_that_was_cancelled_leaves_the_drive_usable(client: Client) -> None:

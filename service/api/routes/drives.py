@@ -10,7 +10,7 @@ from fastapi import APIRouter, Depends, Query, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
 
-from schemas.api.drives import DriveResource, DriveState, PreflightResource
+from schemas.api.drives import DriveResource, DriveState, PreflightResource, PreflightState
 from schemas.api.resource import Finding, Page
 from schemas.drive import DriveManifest, Vehicle
 from service.api.context import Context
@@ -89,10 +89,22 @@ def list_drives(
     limit: Limit = 50,
     cursor: Cursor = None,
     vehicle: Annotated[Vehicle | None, Query(description="only of this vehicle")] = None,
+    preflight: Annotated[
+        list[PreflightState] | None,
+        Query(max_length=len(PreflightState), description="only with this state of the check; may be repeated"),
+    ] = None,
 ) -> Page[DriveResource]:
     """Drives of the project, newest first."""
     with context.database.read() as session:
-        found, following = newest(session, Drive, caller.project_id, cursor=cursor, limit=limit, vehicle=vehicle)
+        found, following = newest(
+            session,
+            Drive,
+            caller.project_id,
+            cursor=cursor,
+            limit=limit,
+            conditions=[Drive.preflight_state.in_(preflight)] if preflight else (),
+            vehicle=vehicle,
+        )
         stored = drives.stored_of(session, found)
     return Page(items=[shown(drive, stored[drive.id]) for drive in found], next=following)
 
@@ -197,6 +209,7 @@ def _shown(session: Session, drive: Drive) -> DriveResource:
 
 def shown(drive: Drive, stored: Stored) -> DriveResource:
     """A drive as the API shows it."""
+    severities = [finding["severity"] for finding in drive.findings]
     return DriveResource.model_validate(
         {
             "id": drive.id,
@@ -210,6 +223,8 @@ def shown(drive: Drive, stored: Stored) -> DriveResource:
             "files_stored": stored.files,
             "bytes_stored": stored.size_bytes,
             "preflight": drive.preflight_state,
+            "preflight_errors": severities.count("error"),
+            "preflight_warnings": severities.count("warning"),
             "preflight_job_id": drive.preflight_job_id,
             "created_at": moment(drive.created_us),
             "committed_at": moment(drive.committed_us),

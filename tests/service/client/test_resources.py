@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from sqlalchemy import delete
 
+from schemas.api.drives import PreflightState
 from schemas.api.exports import ExportRequest
 from schemas.api.jobs import JobKind, JobState
 from schemas.api.problems import PROBLEM_TYPE, Problem
@@ -21,7 +22,7 @@ from schemas.api.webhooks import WebhookEvent, WebhookRequest
 from service.client import ApiError, AsyncClient, Client, ClientError, download, watch_job
 from service.client import api as client_api
 from service.commands.client_program import main
-from service.database.tables import Job
+from service.database.tables import Drive, Job
 from service.domain import exports, jobs
 from tests.helpers.live_api import LIMITS, SCENE_FILES
 from tests.helpers.live_api import Client as Owner
@@ -187,6 +188,46 @@ def test_a_list_of_jobs_says_which_drive_and_why(
     monkeypatch.delenv("MRASFM_URL")
     assert main(["list", "jobs"]) == 2
     assert "MRASFM_URL" in capsys.readouterr().err
+
+
+def test_a_list_of_drives_says_what_their_check_found(
+    client: Owner, connect: Connect, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MRASFM_API_KEY", client.key)
+    monkeypatch.setenv("MRASFM_URL", client.api.url)
+    warned = {"severity": "warning", "code": "dark", "what": "an image is dark", "remedy": "Look."}
+    wrong = {**warned, "severity": "error"}
+    client.create()
+    drive_ids = [client.committed() for _ in range(6)]
+    with client.api.database.write() as session:
+        for drive_id, state, findings in zip(
+            drive_ids,
+            ("PENDING", "PENDING", "PASSED", "PASSED", "REJECTED", "UNKNOWN"),
+            ([], [warned], [], [warned, warned], [wrong, wrong, warned], []),
+            strict=True,
+        ):
+            drive = session.get_one(Drive, drive_id)
+            drive.preflight_state, drive.findings = PreflightState(state), findings
+        failed_check = drive.preflight_job_id
+    assert main(["list", "drives"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split("Z  ")[1:] for line in lines[::-1]] == [
+        [],
+        ["check runs"],
+        ["check runs: 1 warning so far"],
+        ["check passed: no finding"],
+        ["check passed: 2 warnings"],
+        ["check rejected: 2 errors, 1 warning"],
+        [f"check failed: {failed_check}"],
+    ]
+    assert main(["list", "drives", "--preflight", "rejected", "--preflight", "UNKNOWN"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == drive_ids[:3:-1]
+    assert main(["list", "drives", "--preflight", "bad"]) == 2
+    assert main(["list", "jobs", "--preflight", "PASSED"]) == 2
+    assert "list drives" in capsys.readouterr().err
+    library = connect(client)
+    assert [drive.id for drive in library.drives(preflight=PreflightState.PASSED)] == [drive_ids[3], drive_ids[2]]
+    assert len(list(library.drives(preflight=[PreflightState.REJECTED, PreflightState.NONE]))) == 2
 
 
 def test_an_export_outlives_the_record_of_its_job(
