@@ -25,7 +25,7 @@ from mrasfm_engine.export.picture_files import png_of
 from mrasfm_engine.export.scene import write_scene
 from schemas.api.problems import Problem
 from schemas.drive import DriveManifest
-from service.database.tables import MapVersion, Scene
+from service.database.tables import Drive, MapVersion, Scene
 from service.domain import jobs
 from tests.helpers.export_example import make_scene
 from tests.helpers.live_api import ONE_ATTEMPT, REPOSITORY, Api, Client, api_in_thread, settings_of
@@ -93,6 +93,16 @@ class Watched:
         else:
             self.foreign.append(route.request.url)
             route.abort()
+
+
+MAP_FINDING = {
+    "severity": "warning",
+    "code": "drive-left-out",
+    "what": "drive third has no scene",
+    "remedy": "Look at its job.",
+}
+
+DRIVE_FINDING = {"severity": "warning", "code": "dark", "what": "an image is dark", "remedy": "Look at it."}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -176,6 +186,7 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
         "pictures/a.png": png_of(noise),
         "pictures/b.png": png_of(noise),
         "calibration/example.json": files["calibration.json"],
+        "report.json": json.dumps({**json.loads(files["report.json"]), "findings": [MAP_FINDING]}).encode(),
     }
     job = client.aggregate(scenes=scene_ids, name="crossing")
     client.publish_map(client.claim(job["id"]), map_files)
@@ -187,6 +198,7 @@ def _filled(api: Api, client: Client, folder: Path) -> World:
     with api.database.write() as session:  # the helpers' summary is of a scene without a place on the earth
         for row in (*session.scalars(select(Scene)), *session.scalars(select(MapVersion))):
             row.summary = {**row.summary, "georeferenced": True}
+        session.get_one(Drive, drives[0]).findings = [DRIVE_FINDING]
     return World(
         api=api,
         client=client,

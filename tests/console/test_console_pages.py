@@ -13,7 +13,7 @@ import pytest
 from playwright.sync_api import Page, ViewportSize, expect
 
 from service.domain.keys import revoke_key
-from tests.console.conftest import Open, World, go, log_in, wait_for
+from tests.console.conftest import MAP_FINDING, Open, World, go, log_in, wait_for
 from tests.helpers.slow import slow
 
 WIDE: ViewportSize = {"width": 1280, "height": 800}
@@ -195,6 +195,24 @@ def test_versions_are_compared_and_rolled_back(open_console: Open, world: World)
     page.locator("tbody tr:nth-child(2) .badge", has_text="current").wait_for()
     assert world.client.get(f"/v1/maps/{world.map_id}").json()["current_version"] == 1
     world.client.put(f"/v1/maps/{world.map_id}/current-version", json={"version": 2})
+
+
+def test_the_list_of_drives_counts_findings_of_the_check(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["drives"])
+    expect(page.get_by_role("row", name="example").get_by_text("1 warning")).to_have_count(1)
+    expect(page.locator("table").get_by_text("warning")).to_have_count(1)
+
+
+def test_a_map_lists_its_findings(open_console: Open, world: World) -> None:
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, world.pages["map"])
+    listed = page.locator("ul.findings li")
+    expect(listed).to_have_count(1)
+    expect(listed).to_contain_text(f"Warning: {MAP_FINDING['what']}")
+    expect(listed).to_contain_text(MAP_FINDING["remedy"])
 
 
 def test_a_seam_shows_its_pictures_and_a_missing_one_its_reason(open_console: Open, world: World) -> None:

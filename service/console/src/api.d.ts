@@ -99,6 +99,8 @@ export interface components {
             files_stored: number;
             bytes_stored: number;
             preflight: components["schemas"]["PreflightState"];
+            preflight_errors: number;
+            preflight_warnings: number;
             preflight_job_id?: string | null;
             committed_at?: string | null;
         };

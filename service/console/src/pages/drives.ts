@@ -31,7 +31,7 @@ function DriveTable({ drives, chosen, choose }: { drives: readonly Drive[]; chos
             checked=${chosen.includes(drive.id)} onChange=${(event: Event) => choose(drive.id, (event.target as HTMLInputElement).checked)} /></td>
           <td><a href=${link("drives", drive.id)}>${drive.name}</a>${drive.vehicle && html`<div class="muted small">${drive.vehicle}</div>`}</td>
           <td><${Badge} state=${drive.state} /></td>
-          <td><${Badge} state=${drive.preflight} /></td>
+          <td><${Badge} state=${drive.preflight} /><div class="muted small">${found(drive)}</div></td>
           <td class="number">${drive.cameras}</td>
           <td class="number">${count(drive.frames)}</td>
           <td class="number">${count(drive.files_stored)} of ${count(drive.files_expected)}</td>
@@ -70,6 +70,12 @@ export function DrivePage({ id }: { id: string }): Shown {
   return html`<${Heading} title=${drive?.name ?? "Drive"} kind="Drive">${drive && html`<${DriveActions} drive=${drive} />`}<//>
     <${Content} of=${loaded}>${(shown: Drive) => html`<${DriveFacts} drive=${shown} />`}<//>
     ${drive && html`<${Checks} drive=${drive} /><${ScenesOf} drive=${drive} /><${JobsOf} drive=${drive} />`}`;
+}
+
+/** Number of errors and warnings that the check found; empty where it found none. */
+function found(drive: Drive): string {
+  const counts: [number, string][] = [[drive.preflight_errors, "error"], [drive.preflight_warnings, "warning"]];
+  return counts.filter(([value]) => value > 0).map(([value, what]) => plural(value, what)).join(", ");
 }
 
 function DriveFacts({ drive }: { drive: Drive }): Shown {
