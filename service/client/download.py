@@ -5,12 +5,14 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 from pydantic import TypeAdapter, ValidationError
 
+from schemas.api.jobs import JobResource
 from schemas.api.maps import MapVersionResource
 from schemas.artifacts import REPORT_FILE
 from schemas.drive import RelativePath
@@ -88,6 +90,31 @@ def require_free(out: Path, scene_id: str | None) -> None:
     if scene_id is not None and held != scene_id:
         raise SceneFolderError(
             f"{out} holds the {_kind(held)} {held}, not {scene_id}. Give another folder, or remove it."
+        )
+
+
+def require_free_for_job(out: Path, known_job: Callable[[], JobResource | None]) -> None:
+    """Refuse a folder that holds another result than a job's, before anything is done for that job.
+
+    Parameters
+    ----------
+    known_job
+        Job that is there already; None where a new one will be made. Called only where the folder holds a result.
+
+    Raises
+    ------
+    SceneFolderError
+    """
+    held = _scene_in(out)
+    if held is None:
+        return
+    job = known_job()
+    expected = None if job is None else job.scene_id
+    if job is not None and job.map_version is not None:
+        expected = f"{job.map_id}/{job.map_version}"
+    if held != expected:
+        raise SceneFolderError(
+            f"{out} holds the {_kind(held)} {held}, and this gives another one. Give another folder, or remove it."
         )
 
 

@@ -90,18 +90,23 @@ def start_aggregation(client: Client, asked: AggregationRequest, *, state: Uploa
     return _asked(client, asked, state, lambda key: client.aggregate(asked, idempotency_key=key))
 
 
+def known_job(client: Client, what: BaseModel, *, state: UploadState) -> JobResource | None:
+    """Job that the same request made before, unless it failed, was cancelled, or its result is gone."""
+    record = state.job(what)
+    return None if record is None or record.job_id is None else _usable_job(client, record.job_id)
+
+
 def _asked(
     client: Client, what: BaseModel, state: UploadState | None, ask: Callable[[str | None], JobResource]
 ) -> JobResource:
     if state is None:
         return ask(None)
+    known = known_job(client, what, state=state)
+    if known is not None:
+        return known
     record = state.job(what)
-    if record is not None and record.job_id is not None:
-        known = _usable_job(client, record.job_id)
-        if known is not None:
-            return known
-        record = None
-    record = record or state.begin_job(what)
+    if record is None or record.job_id is not None:
+        record = state.begin_job(what)
     job = ask(record.key)
     record.job_id = job.id
     state.save()

@@ -77,6 +77,18 @@ class Conversation:
         self.summary.job_id, self.summary.job_state = job.id, job.state
         self.say(f"job {job.id}: {self.client.url}/v1/jobs/{job.id}")
 
+    def require_free_out(self, known_job: Callable[[], JobResource | None]) -> None:
+        """Refuse a folder of `--out` that holds another result than the one to come, as `require_free_for_job`.
+
+        Raises
+        ------
+        SceneFolderError
+        """
+        from service.client.download import require_free_for_job
+
+        if self.arguments.out is not None:
+            require_free_for_job(self.arguments.out, known_job)
+
     def wait(self, job: JobResource) -> JobResource:
         """Wait for the job's end."""
         from service.client import watch_job

@@ -297,6 +297,7 @@ def _result(client: Client, given: str) -> Result:
 
 def _export(conversation: Conversation, summary: Summary) -> int:
     from schemas.api.jobs import JobState
+    from service.client.download import require_free
 
     client, arguments = conversation.client, conversation.arguments
     kind, first, version = _kind_of(arguments.id)
@@ -309,6 +310,7 @@ def _export(conversation: Conversation, summary: Summary) -> int:
         raise _unknown(f"{arguments.id} is no scene or map")
     conversation.say(f"export {export.id}: {client.url}/v1/exports/{export.id}")
     if arguments.out is not None:
+        require_free(arguments.out, export.id)  # before the wait
         if export.state != JobState.SUCCEEDED:  # the record of an older job may have expired
             job = conversation.wait(client.job(export.job_id))
             export = client.export(export.id)

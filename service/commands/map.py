@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +13,9 @@ from service.commands.client_common import CommandSummary, Conversation, add_com
 
 if TYPE_CHECKING:
     from schemas.api.aggregations import AggregationRequest
+    from schemas.api.jobs import JobResource
     from schemas.api.maps import MapVersionResource
+    from service.client import UploadState
 
 
 @dataclass(kw_only=True)
@@ -61,6 +64,7 @@ def _converse(conversation: Conversation, summary: Summary) -> int:
     folders = [DriveFolder.read(path) for path in arguments.drives]
     _asked(arguments, [])  # what cannot be asked for is said before the drives are sent
     states = [UploadState(folder, client.url) for folder in folders]
+    conversation.require_free_out(lambda: _known_job(conversation, states))
     with summary.timed("upload"):
         for folder, state in zip(folders, states, strict=True):
             summary.drive_ids.append(conversation.send(folder, state).drive_id)
@@ -77,6 +81,16 @@ def _converse(conversation: Conversation, summary: Summary) -> int:
     summary.unconnected, summary.failed = list(version.unconnected), [drive.drive_id for drive in version.failed]
     conversation.download(version)
     return 0
+
+
+def _known_job(conversation: Conversation, states: Sequence[UploadState]) -> JobResource | None:
+    """Job of the same command before, where it may be used again."""
+    from service.client.upload import known_job
+
+    drive_ids = [state.record.drive_id for state in states if state.record.drive_id is not None]
+    if not states or len(drive_ids) < len(states):
+        return None
+    return known_job(conversation.client, _asked(conversation.arguments, drive_ids), state=states[0])
 
 
 def _asked(arguments: argparse.Namespace, drive_ids: list[str]) -> AggregationRequest:

@@ -47,15 +47,17 @@ def run(arguments: argparse.Namespace) -> int:
 def _converse(conversation: Conversation, summary: Summary) -> int:
     from schemas.api.jobs import JobState, ReconstructionSettings
     from service.client import DriveFolder, UploadState, scene_findings, start_reconstruction
+    from service.client.upload import known_job
 
     client, arguments = conversation.client, conversation.arguments
     folder = DriveFolder.read(arguments.drive)
     state = UploadState(folder, client.url)
+    settings = ReconstructionSettings(use_gnss=not arguments.no_gnss)
+    conversation.require_free_out(lambda: known_job(client, settings, state=state))
     sent = conversation.send(folder, state)
     summary.drive_id, summary.bytes_sent = sent.drive_id, sent.bytes_sent
     summary.files_sent, summary.files_skipped = sent.files_sent, sent.files_skipped
     summary.seconds.update(sent.seconds)
-    settings = ReconstructionSettings(use_gnss=not arguments.no_gnss)
     job = start_reconstruction(client, sent.drive_id, settings, state=state)
     summary.scene_id = job.scene_id
     conversation.note_job(job)

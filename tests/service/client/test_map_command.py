@@ -90,6 +90,12 @@ def test_a_map_and_its_next_version(
     # The same command again asks for nothing new.
     _, again, _ = run(client, monkeypatch, capsys, *drives, "--out", out, "--name", "Kreuzung")
     assert (again["job_id"], again["version"]) == (summary["job_id"], 1)
+    # Another map does not go into its folder, and nothing is sent for it.
+    counts = [len(client.get(f"/v1/{what}").json()["items"]) for what in ("drives", "jobs")]
+    for words in ((*drives, "--name", "other"), (drives[0], drives[1]), ("--into", summary["map_id"], drives[1])):
+        code, _, said = run(client, monkeypatch, capsys, *words, "--out", out)
+        assert (code, f"{out} holds the map {summary['map_id']}/1, and this gives another one" in said) == (2, True)
+    assert [len(client.get(f"/v1/{what}").json()["items"]) for what in ("drives", "jobs")] == counts
     # A version without the last drive, which has no third scene to keep: refused in the service's words.
     refused = run(client, monkeypatch, capsys, "--into", summary["map_id"], "--remove", summary["drive_ids"][2])
     assert refused[0] == 2

@@ -264,6 +264,8 @@ def test_commands(
     assert run(client, capsys, "download", scene_id, "--out", str(tmp_path / "scene"))[0] == 0
     assert run(client, capsys, "show", export["id"])[1]["items"][0]["state"] == "SUCCEEDED"
     assert run(client, capsys, "delete", export["id"])[0] == 0
+    other = run(client, capsys, "export", scene_id, "--format", "kitti", "--out", str(tmp_path / "scene"))
+    assert (other[0], f"holds the scene {scene_id}" in other[1]["error"]) == (2, True), "before the wait"
     job = client.reconstruct(client.committed())
     assert run(client, capsys, "cancel", job["id"])[1]["job_state"] == "CANCELLED"
     assert run(client, capsys, "wait", job["id"])[0] == 3

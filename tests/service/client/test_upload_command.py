@@ -277,6 +277,22 @@ def test_a_folder_that_is_taken_is_refused_before_the_upload(client: Client, dri
     assert client.get("/v1/drives").json()["items"] == []
 
 
+def test_a_folder_of_another_scene_is_refused_before_the_upload(client: Client, drive: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    running = Upload(drive, "--out", str(out), url=client.api.url, key=client.key)
+    wait_until(lambda: _reconstructions(client), "the job's start")
+    scene_id = client.publish(client.claim(_reconstructions(client)[0]["id"]), {"report.json": b"{}"})
+    assert running.ended()[0] == 0
+    drive_ids = [drive["id"] for drive in client.get("/v1/drives").json()["items"]]
+    code, summary, told = upload(client, drive, "--no-gnss", "--out", str(out))
+    assert (code, summary["job_id"]) == (2, None)
+    assert f"{out} holds the scene {scene_id}, and this gives another one. Give another folder" in told
+    other = written(tiny_drive("other", seed=f"{tmp_path} other"), tmp_path / "other")
+    assert upload(client, other, "--out", str(out))[0] == 2
+    assert [drive["id"] for drive in client.get("/v1/drives").json()["items"]] == drive_ids
+    assert len(_reconstructions(client)) == 1
+
+
 def test_a_failed_job_is_3_with_its_problem(client: Client, drive: Path) -> None:
     running = Upload(drive, "--wait", url=client.api.url, key=client.key)
     wait_until(lambda: _reconstructions(client), "the job's start")
