@@ -20,7 +20,7 @@ from mrasfm_engine.export.formats import CHECKS, WRITERS
 from mrasfm_engine.export.publishing import publishing, while_nothing_moves
 from mrasfm_engine.export.scene import write_json
 from mrasfm_engine.export.stored_scene import read_source
-from mrasfm_engine.geometry.earth_system import named_system
+from mrasfm_engine.geometry.earth_system import named_system, system_of_name
 from mrasfm_engine.io.stage_store import fingerprints_of_images, sha256_of_files
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
@@ -178,6 +178,8 @@ def check_request(request: ExportRequest) -> None:
             remedy=_listed("Formats that do", (f.name for f in EXPORT_FORMATS.values() if f.takes_crs)),
             code="crs-not-taken",
         )
+    if request.options.crs is not None:
+        system_of_name(request.options.crs)  # before the scene is read
     with while_nothing_moves(request.out):
         _replaced(request)
 

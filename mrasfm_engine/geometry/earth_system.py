@@ -19,7 +19,7 @@ from pyproj.transformer import TransformerGroup
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import geodesy, utm
 from mrasfm_engine.types import Floats
-from schemas.earth_systems import REMEDY, EarthSystemError, parse_system
+from schemas.earth_systems import REMEDY, EarthSystemError, NamedSystem, parse_system
 from schemas.findings import listed
 
 _SOURCE = "EPSG:4979"
@@ -92,6 +92,20 @@ def utm_system(latitude_deg: float, longitude_deg: float) -> EarthSystem:
     return EarthSystem(name=f"EPSG:{code}", well_known_text=utm.well_known_text(code), horizontal=code, code=code)
 
 
+def system_of_name(name: str) -> NamedSystem:
+    """The parts of the system that a user names, wherever the scene is.
+
+    Raises
+    ------
+    InputError
+        Where there is none of this name, or it is not a projected one.
+    """
+    try:
+        return parse_system(name)
+    except EarthSystemError as error:
+        raise InputError(str(error), remedy=REMEDY, code="bad-crs") from None
+
+
 def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
     """The system that a user names.
 
@@ -106,10 +120,7 @@ def named_system(name: str, *, at: tuple[float, float]) -> EarthSystem:
         Where there is none of this name, it is not a projected one, the scene is far from its area, or its grid is not
         installed.
     """
-    try:
-        named = parse_system(name)
-    except EarthSystemError as error:
-        raise InputError(str(error), remedy=REMEDY, code="bad-crs") from None
+    named = system_of_name(name)
     horizontal, vertical = named.horizontal, named.vertical
     _require_near(name, horizontal, at)
     target = horizontal.to_3d() if vertical is None else CRS.from_user_input(name)

@@ -205,7 +205,12 @@ def test_what_a_scene_does_not_have_is_refused_by_name(scene_folder: Path, tmp_p
     assert refused(formats=["dxf"]).code == "unknown-format"
     assert refused(formats=[]).code == "unknown-format"
     assert refused(options=ExportOptions(image_size_px=5)).code == "bad-image-size"
-    assert refused(options=ExportOptions(crs="EPSG:25832")).code == "crs-not-taken"
+    elsewhere = tmp_path / "none"
+    for formats in (["kitti"], ["mcap", "nuscenes"]):
+        options = ExportOptions(crs="EPSG:25832")
+        assert refused(folder=elsewhere, formats=formats, options=options).code == "crs-not-taken"
+    for crs in ("EPSG:x", "EPSG:1", "EPSG:4326"):  # before the scene is read, which may be large
+        assert refused(folder=elsewhere, formats=["mcap", "copc"], options=ExportOptions(crs=crs)).code == "bad-crs"
     assert refused(out=scene_folder).code == "bad-out-folder"
     (tmp_path / "mine" / "kitti").mkdir(parents=True)
     assert refused(out=tmp_path / "mine").code == "bad-out-folder"
