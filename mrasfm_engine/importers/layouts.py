@@ -245,8 +245,8 @@ def samples_around(samples: list[GnssSample], units: list[SourceUnit]) -> list[G
     """The samples that matter to the units, in the order of the file.
 
     Those within `GNSS_MARGIN_US` of the units' time span, and the nearest beyond each end, so that positions at the
-    first and last image can be interpolated. If none is near, all are kept: the mismatch is then seen when the drive
-    is checked.
+    first and last image can be interpolated. If none is near, and none lies before the units or none after them, all
+    are kept: the mismatch is then seen when the drive is checked.
     """
     times = np.array([sample.timestamp_us for sample in samples], dtype=np.int64)
     start, end = units[0].timestamp_us, units[-1].timestamp_us
@@ -254,6 +254,7 @@ def samples_around(samples: list[GnssSample], units: list[SourceUnit]) -> list[G
     lower = min(start - GNSS_MARGIN_US, int(before.max()) if len(before) else start)
     upper = max(end + GNSS_MARGIN_US, int(after.min()) if len(after) else end)
     inside = (times >= lower) & (times <= upper)
-    if not ((times >= start - GNSS_MARGIN_US) & (times <= end + GNSS_MARGIN_US)).any():
+    is_near = ((times >= start - GNSS_MARGIN_US) & (times <= end + GNSS_MARGIN_US)).any()
+    if not is_near and not (len(before) and len(after)):
         return samples
     return [sample for sample, keep in zip(samples, inside, strict=True) if keep]

@@ -228,6 +228,18 @@ def test_gnss_is_kept_around_the_frames(recording: Path, tmp_path: Path) -> None
     assert [s.timestamp_us for s in gnss.samples] == [5_000_000, 10_000_000, 15_000_000]
 
 
+def test_of_gnss_without_samples_near_the_frames_the_nearest_are_kept(recording: Path, tmp_path: Path) -> None:
+    """A slice in a tunnel takes no sample of the way to it and of the way from it but the last and the first."""
+    times_us = [*range(0, 10_000_000, 1_000_000), *range(40_000_000, 50_000_000, 1_000_000)]
+    rows = [f"{t},{49 + t / 1e9:.6f},8.4,110.0,0.5,1.0" for t in times_us]
+    (recording / "tunnel.csv").write_text("\n".join([HEADER, *rows]) + "\n")
+    (recording / "times.txt").write_text("".join(f"{20.0 + i}\n" for i in range(8)))
+    import_recording(recording, tmp_path / "drive", frames="2:6", gnss_file=Path("tunnel.csv"))
+    gnss = read_drive(tmp_path / "drive").manifest.gnss
+    assert gnss is not None
+    assert [s.timestamp_us for s in gnss.samples] == [9_000_000, 40_000_000]
+
+
 def test_gnss_of_another_time_is_kept_for_the_check(recording: Path, tmp_path: Path) -> None:
     text = (recording / "gnss.csv").read_text().splitlines()
     moved = [text[0], *(f"{18_000_000 + 100_000 * i},{line.partition(',')[2]}" for i, line in enumerate(text[1:]))]
