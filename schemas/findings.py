@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
 
 class Severity(StrEnum):
@@ -26,25 +27,35 @@ class Finding:
         One sentence that names the file or field.
     remedy
         One sentence that says what to do.
+    count
+        Number of defects: over one where the finding stands for others like one before it.
     """
 
     severity: Severity
     code: str
     what: str
     remedy: str
+    count: int = 1
 
     def __str__(self) -> str:
         return f"{self.severity}: {self.what}\n  {self.remedy}"
 
 
-def as_json(finding: Finding) -> dict[str, str]:
-    """A finding as it stands in a report."""
+def as_json(finding: Finding) -> dict[str, Any]:
+    """A finding as it stands in a report; with `count` where that is not one."""
     return {
         "severity": str(finding.severity),
         "code": finding.code,
         "what": finding.what,
         "remedy": finding.remedy,
+        **({} if finding.count == 1 else {"count": finding.count}),
     }
+
+
+def more_errors(counts: Sequence[int]) -> str:
+    """Words on how many errors there are besides one, from the counts of all findings that are errors; may be empty."""
+    more = sum(counts) - 1
+    return f" ({more} more error{'' if more == 1 else 's'})" if more > 0 else ""
 
 
 def error(code: str, what: str, remedy: str) -> Finding:

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from schemas.api.resource import Finding
+from schemas.findings import more_errors
 from schemas.parsing import DocumentError
 
 _NO_MAP = "No map can come of this"
@@ -502,7 +503,7 @@ def store_unavailable() -> StoreUnavailable:
 def drive_rejected(drive_id: str, findings: Sequence[Finding]) -> DriveRejected:
     """Make the error of a drive whose check found errors; its detail names the first."""
     errors = [finding for finding in findings if finding.severity == "error"]
-    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    more = more_errors([finding.count for finding in errors])
     what = errors[0].what if errors else "its check found that it cannot be reconstructed"
     remedy = errors[0].remedy if errors else "Correct the drive, and upload it as a new one."
     return DriveRejected(f"drive {drive_id}: {what}{more}", remedy=remedy, findings=findings)

@@ -134,7 +134,7 @@ class ChildError:
     remedy: str
     retryable: bool
     is_storage: bool = False
-    findings: list[dict[str, str]] = field(default_factory=list)
+    findings: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -11,7 +11,7 @@ from mrasfm_engine.preflight.lenses import lens_findings
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.types import CountProgress
 from schemas import DriveManifest
-from schemas.findings import Finding, Severity, error
+from schemas.findings import Finding, Severity, error, more_errors
 from schemas.manifest_check import check_manifest, errors_first
 
 
@@ -26,7 +26,7 @@ class UnsoundDriveError(InputError):
 
     def __init__(self, findings: Sequence[Finding]) -> None:
         errors = [finding for finding in findings if finding.severity is Severity.ERROR]
-        more = f" ({len(errors) - 1} more errors)" if len(errors) > 1 else ""
+        more = more_errors([finding.count for finding in errors])
         super().__init__(errors[0].what + more, remedy=errors[0].remedy, code=errors[0].code)
         self.findings = tuple(findings)
 

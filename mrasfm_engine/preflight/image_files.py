@@ -187,13 +187,14 @@ def _gather(findings: list[Finding], shown: int = 5) -> list[Finding]:
     for code, group in by_code.items():
         result += group[:shown]
         if len(group) > shown:
-            last = group[-1]
+            last, rest = group[-1], len(group) - shown
             result.append(
                 Finding(
                     severity=Severity(last.severity),
                     code=code,
-                    what=f"the same holds for {len(group) - shown} more files",
+                    what=f"the same holds for {rest} more file{'' if rest == 1 else 's'}",
                     remedy=last.remedy,
+                    count=rest,
                 )
             )
     return result

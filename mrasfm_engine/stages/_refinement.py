@@ -38,7 +38,7 @@ class _Refined:
     """A refined component."""
 
     scene: Scene
-    findings: list[dict[str, str]]
+    findings: list[dict[str, Any]]
     report: dict[str, Any]  # of the stage
     seconds: float
 

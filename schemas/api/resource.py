@@ -108,6 +108,7 @@ class Finding(Resource):
                     "what": "GNSS jumps at gnss.samples.412: 38 m in 0.1 s at the first",
                     "remedy": "Nothing needs to be done for single outliers, which are rejected; for many, check the "
                     "receiver's data or give larger sigmas.",
+                    "count": 1,
                 }
             ]
         }
@@ -117,6 +118,7 @@ class Finding(Resource):
     code: str = Field(description="stable; in lower case with dashes")
     what: str = Field(description="one sentence that names the file or field")
     remedy: str = Field(description="one sentence that says what to do")
+    count: int = Field(1, description="number of defects: over one where it stands for others like one before it")
 
 
 class Times(Resource):

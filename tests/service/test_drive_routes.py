@@ -266,17 +266,22 @@ def test_what_the_check_of_the_images_finds_is_shown(client: Client) -> None:
     check = client.get(f"/v1/drives/{drive_id}/preflight").json()
     assert (check["state"], check["findings"]) == ("PENDING", [])
     finding = Finding(severity="error", code="blurred", what="all images are blurred", remedy="Clean the lens.")
+    others = Finding(severity="error", code="blurred", what="7 more", remedy="Clean it.", count=7)
+    warned = Finding(severity="warning", code="dark", what="an image is dark", remedy="Clean the lens.")
+    findings = [finding.model_dump(exclude={"count"}), others.model_dump(), warned.model_dump()]  # as older ones are
     with client.api.database.write() as session:
         held = jobs.claim(session, check["job_id"], owner="worker@test", lease_us=60_000_000)
         assert held is not None
-        jobs.record_findings(session, held, [finding.model_dump()], sound=False)
+        jobs.record_findings(session, held, findings, sound=False)
     (listed,) = client.get("/v1/drives").json()["items"]
-    assert (listed["preflight"], listed["preflight_errors"], listed["preflight_warnings"]) == ("REJECTED", 1, 0)
+    assert (listed["preflight"], listed["preflight_errors"], listed["preflight_warnings"]) == ("REJECTED", 8, 1)
     shown = client.get(f"/v1/drives/{drive_id}/preflight").json()
-    assert shown == {"state": "REJECTED", "job_id": check["job_id"], "findings": [finding.model_dump()]}
+    told = [one.model_dump() for one in (finding, others, warned)]
+    assert shown == {"state": "REJECTED", "job_id": check["job_id"], "findings": told}
     answer = client.post("/v1/reconstructions", json={"drive_id": drive_id})
     problem = problem_of(answer, 422, "drive-rejected")
-    assert problem["findings"] == [finding.model_dump()]
+    assert [Finding.model_validate(one) for one in problem["findings"]] == [finding, others, warned]
+    assert problem["detail"] == f"drive {drive_id}: all images are blurred (7 more errors)"
     assert problem["remedy"] == "Clean the lens."
 
 

@@ -23,6 +23,7 @@ import httpx
 import psutil
 import pytest
 
+from schemas.api.resource import Finding
 from tests.helpers.live_api import Api, Client, api_in_thread, api_process, problem_of, settings_of, wait_until
 from tests.helpers.tiny_drive import TinyDrive, manifest, png, png_of, tiny_drive, zip_of
 from tests.service.conftest import StartApi
@@ -211,20 +212,20 @@ def test_what_the_engine_finds_in_the_manifest_is_said_in_its_words(
     drive_id = client.filled(TinyDrive(document, {name: drive.files[name] for name in named}))
     told = engine_findings(path)
     answer = client.post(f"/v1/drives/{drive_id}:commit")
-    if any(finding["severity"] == "error" for finding in told):
-        assert problem_of(answer, 422, "drive-rejected")["findings"] == told
+    if any(finding.severity == "error" for finding in told):
+        found = problem_of(answer, 422, "drive-rejected")["findings"]
         assert client.get(f"/v1/drives/{drive_id}").json()["state"] == "OPEN"
     else:
         assert answer.status_code == 200
-        assert client.get(f"/v1/drives/{drive_id}/preflight").json()["findings"] == told
+        found = client.get(f"/v1/drives/{drive_id}/preflight").json()["findings"]
+    assert [Finding.model_validate(finding) for finding in found] == told
     assert told, "the engine finds something"
 
 
-def engine_findings(path: Path) -> list[dict[str, Any]]:
+def engine_findings(path: Path) -> list[Finding]:
     command = [str(Path(sys.executable).with_name("mrasfm")), "preflight", "--manifest-only", "--json", str(path)]
     done = subprocess.run(command, capture_output=True, check=False)
-    findings: list[dict[str, Any]] = json.loads(done.stdout)["findings"]
-    return findings
+    return [Finding.model_validate(finding) for finding in json.loads(done.stdout)["findings"]]
 
 
 def endless(size_bytes: int) -> Iterator[bytes]:

@@ -22,6 +22,7 @@ from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.cli import main
 from schemas import DocumentError, parse_new_manifest
 from schemas.api.problems import PROBLEM_TYPE
+from schemas.api.resource import Finding
 from service.database.tables import Blob, Checkpoint, Drive, DriveFile, Job, SceneFile
 from service.domain import jobs
 from service.storage.process_folder import process_folder
@@ -149,7 +150,8 @@ def test_unsound_drive(world: World, own_brief_drive: Path, tmp_path: Path, capf
     assert run(world, check_id).state == "SUCCEEDED"
     drive = world.drive(drive_id)
     assert drive.preflight_state == "REJECTED"
-    assert drive.findings == problem["findings"]
+    of_check, of_job = ([*map(Finding.model_validate, found)] for found in (drive.findings, problem["findings"]))
+    assert of_check == of_job
     assert sum(finding["severity"] == "error" for finding in drive.findings) == 2
 
 

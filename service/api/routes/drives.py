@@ -209,7 +209,8 @@ def _shown(session: Session, drive: Drive) -> DriveResource:
 
 def shown(drive: Drive, stored: Stored) -> DriveResource:
     """A drive as the API shows it."""
-    severities = [finding["severity"] for finding in drive.findings]
+    findings = [Finding.model_validate(finding) for finding in drive.findings]
+    counts = {name: sum(f.count for f in findings if f.severity == name) for name in ("error", "warning")}
     return DriveResource.model_validate(
         {
             "id": drive.id,
@@ -223,8 +224,8 @@ def shown(drive: Drive, stored: Stored) -> DriveResource:
             "files_stored": stored.files,
             "bytes_stored": stored.size_bytes,
             "preflight": drive.preflight_state,
-            "preflight_errors": severities.count("error"),
-            "preflight_warnings": severities.count("warning"),
+            "preflight_errors": counts["error"],
+            "preflight_warnings": counts["warning"],
             "preflight_job_id": drive.preflight_job_id,
             "created_at": moment(drive.created_us),
             "committed_at": moment(drive.committed_us),

@@ -163,6 +163,7 @@ export interface components {
             code: string;
             what: string;
             remedy: string;
+            count?: number;
         };
         Frame: {
             timestamp_us: number;

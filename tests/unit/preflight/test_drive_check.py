@@ -17,6 +17,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.geodesy import ecef_from_local, geodetic_from_local
 from mrasfm_engine.preflight.drive_reader import Finding, Severity, check_drive, read_drive, require_sound
 from mrasfm_engine.scene.drive import pose_from_matrix
+from schemas.findings import as_json
 
 WriteDrive = Callable[[dict[str, Any]], Path]
 Document = dict[str, Any]
@@ -57,7 +58,7 @@ def test_errors_come_first_and_are_raised(drive_document: Document, write_drive:
     (root / "images/right/000001.png").write_bytes(b"")
     found = check_drive(read_drive(root))
     assert [f.severity for f in found] == [Severity.ERROR, Severity.ERROR, Severity.WARNING]
-    with pytest.raises(InputError, match=r"000001.png is empty .* \(1 more errors\)") as caught:
+    with pytest.raises(InputError, match=r"000001.png is empty .* \(1 more error\)") as caught:
         require_sound(found)
     assert caught.value.code == "empty-file"
     require_sound(found[2:])
@@ -78,6 +79,23 @@ def test_many_missing_images_are_counted(drive_document: Document, write_drive: 
     found = findings(root)["missing-file"]
     assert len(found) == 6
     assert "5 more files" in found[-1].what
+    assert as_json(found[-1])["count"] == 5
+    with pytest.raises(InputError, match=r"images/left/000000.png does not exist \(9 more errors\)"):
+        require_sound(found)
+
+
+@pytest.mark.parametrize(("links", "more"), [(1, ""), (2, " (1 more error)"), (6, " (5 more errors)"), (8, " (7 more")])
+def test_links_out_of_the_drive_are_counted(
+    drive_document: Document, write_drive: WriteDrive, tmp_path: Path, links: int, more: str
+) -> None:
+    root = write_drive(drive_document)
+    for file in sorted(root.glob("images/*/*.png"))[:links]:
+        file.rename(tmp_path / f"{file.parent.name} {file.name}")
+        file.symlink_to(tmp_path / f"{file.parent.name} {file.name}")
+    with pytest.raises(InputError) as caught:
+        require_sound(check_drive(read_drive(root)))
+    assert caught.value.what.startswith(f"file images/left/000000.png is a link to a place outside the drive{more}")
+    assert bool(more) == ("more" in caught.value.what)
 
 
 def test_unlisted_images(drive_document: Document, write_drive: WriteDrive) -> None:

@@ -177,7 +177,7 @@ def test_check_of_the_drive_is_that_and_the_files(drive_document: Document, writ
         require_sound(findings)
     assert isinstance(caught.value, InputError)
     assert caught.value.findings == tuple(findings)
-    assert (caught.value.code, caught.value.what) == ("gnss-order", findings[0].what + " (1 more errors)")
+    assert (caught.value.code, caught.value.what) == ("gnss-order", findings[0].what + " (1 more error)")
 
 
 def program(raw: bytes, *, memory_mb: int = 800) -> subprocess.CompletedProcess[bytes]:
