@@ -337,7 +337,7 @@ def motion_findings(mapper: Mapper) -> list[Finding]:
     return [rig_motion.finding(len(units), int(mapper.registered.sum()))] if len(units) else []
 
 
-def scale_findings(refinement: Refinement) -> list[Finding]:
+def scale_findings(mapper: Mapper, refinement: Refinement) -> list[Finding]:
     """Warn where lengths in the scene are hardly known."""
     certainty = refinement.certainty
     if certainty is None or certainty.sigma_scale <= MAX_SIGMA_SCALE:
@@ -345,14 +345,25 @@ def scale_findings(refinement: Refinement) -> list[Finding]:
     known = "by how much lengths may be off is not known: something that they depend on is not determined"
     if np.isfinite(certainty.sigma_scale):
         known = f"lengths are known to {certainty.sigma_scale:.1%} (one sigma): the drive observes the scale badly"
-    return [
-        warning(
-            "scale-uncertain",
-            known,
-            "Give GNSS positions, or declare sigma_translation_m of cameras whose distances are known better; a longer "
-            "drive with turns, and cameras with a common view, tell the scale as well.",
+    remedy = (
+        f"{_scale_from_gnss(mapper, refinement)}, or declare sigma_translation_m of cameras whose distances are known "
+        "better; a longer drive with turns, and cameras with a common view, tell the scale as well."
+    )
+    return [warning("scale-uncertain", known, remedy)]
+
+
+def _scale_from_gnss(mapper: Mapper, refinement: Refinement) -> str:
+    """Words on what makes GNSS tell the scale: the drive may have it, and the scene may stand where it says."""
+    gnss = mapper.drive.manifest.gnss
+    if refinement.georeferenced:
+        return (
+            "Give GNSS positions of a longer path, or of a receiver with a smaller error: those of the drive are used"
         )
-    ]
+    if refinement.placement is not None:
+        return "Correct the drive's GNSS positions, which are not used; another finding says why"
+    if gnss is not None and gnss.samples:
+        return "Use the drive's GNSS positions, which this run was told to ignore"
+    return "Give GNSS positions"
 
 
 def _poorly_seen(mapper: Mapper) -> list[str]:

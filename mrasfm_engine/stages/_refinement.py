@@ -156,7 +156,7 @@ def _refined(
         findings.append(miscalibration.pair_finding(names, refined.wrong_pair))
     findings += mapping_report.idle_camera_findings(mapper)
     findings += mapping_report.motion_findings(mapper)
-    findings += mapping_report.scale_findings(refined) + length_findings(mapper, refined)
+    findings += mapping_report.scale_findings(mapper, refined) + length_findings(mapper, refined)
     report = {
         **mapping_report.describe_refinement(mapper, refined),
         **mapping_report.describe_between(mapper, between),

@@ -16,8 +16,10 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import scale_findings
+from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement, solver_options
+from schemas import Gnss, GnssSample
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -197,7 +199,7 @@ def test_a_scale_that_the_drive_hardly_observes_is_a_finding() -> None:
         cameras = [c.model_copy(update={"sigma_translation_m": sigma_m}) for c in simulated.drive.cameras]
         simulated = with_cameras(simulated, cameras)
         mapper = with_true_poses(make_model(simulated), simulated, range(8))
-        said[sigma_m] = [finding.code for finding in scale_findings(refine(mapper))]
+        said[sigma_m] = [finding.code for finding in scale_findings(mapper, refine(mapper))]
     assert said == {0.001: [], 0.5: ["scale-uncertain"]}
 
 
@@ -224,8 +226,27 @@ def test_every_parameter_of_a_lens_moves_keypoints_by_as_much(model: str, more: 
 
 def test_a_scale_of_which_no_sigma_is_known_is_said_to_be_uncertain() -> None:
     simulated = make_simulated_drive(units=8, cameras=2, points=600)
-    result = refine(with_true_poses(make_model(simulated), simulated, range(8)))
+    mapper = with_true_poses(make_model(simulated), simulated, range(8))
+    result = refine(mapper)
     assert result.certainty is not None
     result.certainty = replace(result.certainty, sigma_scale=np.inf)
-    (said,) = scale_findings(result)
+    (said,) = scale_findings(mapper, result)
     assert (said.code, "not known" in said.what) == ("scale-uncertain", True)
+    assert said.remedy.startswith("Give GNSS positions, or declare sigma_translation_m")
+    # Drives with GNSS that is ignored, that was refused, and that is used.
+    sample = GnssSample(
+        timestamp_us=0, latitude_deg=49, longitude_deg=8, height_m=0, sigma_horizontal_m=1, sigma_vertical_m=1
+    )
+    gnss = Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[0, 0, 0], samples=[sample])
+    manifest = mapper.drive.manifest.model_copy(update={"gnss": gnss})
+    mapper.drive = replace(mapper.drive, manifest=manifest)
+    used: Any = object()
+    for words, placement in (
+        ("told to ignore", None),
+        ("are not used; another finding says why", Placement(reason="its positions jump")),
+        ("those of the drive are used", Placement(prior=used)),
+    ):
+        result.absolute = AbsolutePriors(placement=placement)
+        (said,) = scale_findings(mapper, result)
+        assert words in said.remedy
+        assert not said.remedy.startswith("Give GNSS positions,")
