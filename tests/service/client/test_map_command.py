@@ -4,59 +4,22 @@ from __future__ import annotations
 
 import argparse
 import json
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.client import SceneFolderError, download
 from service.commands import map as map_command
-from service.database.tables import Job
-from service.domain import jobs
-from tests.helpers.live_api import ONE_ATTEMPT, Client
+from tests.helpers.live_api import Client
 from tests.helpers.tiny_drive import tiny_drive
-from tests.service.client.conftest import Connect, written
-
-FILES = {"points.ply": b"ply" * 1000, "calibration/a.json": b"{}", "map.json": b"{}", "report.json": b"{}"}
-BROKEN = Problem(type=PROBLEM_TYPE + "no-overlap", title="T", detail="it broke", remedy="Look.", retryable=False)
+from tests.service.client.conftest import MAP_FILES, Connect, written
 
 
 @pytest.fixture
 def drives(tmp_path: Path) -> list[Path]:
     return [written(tiny_drive(f"d{i}", seed=f"{tmp_path}{i}"), tmp_path / f"d{i}") for i in range(3)]
-
-
-@pytest.fixture
-def worker(client: Client) -> Iterator[Callable[[set[str]], None]]:
-    """Does jobs of the client's project as they become due; drives of the names given to it fail."""
-    ended, broken = threading.Event(), set[str]()
-
-    def work() -> None:
-        while not ended.wait(0.05):
-            with client.api.database.read() as session:
-                due = [job.id for job in jobs.all_due(session)]
-                mine = [j for j in session.query(Job).filter(Job.id.in_(due)) if j.project_id == client.project_id]
-            for job in mine:
-                held = client.claim(job.id)
-                if job.kind == "AGGREGATION":
-                    client.publish_map(held, FILES, unconnected=("d2",))
-                elif job.kind == "PREFLIGHT":
-                    with client.api.database.write() as session:
-                        jobs.record_findings(session, held, [], sound=True)
-                elif client.get(f"/v1/drives/{job.drive_id}").json()["name"] in broken:
-                    with client.api.database.write() as session:
-                        jobs.fail(session, held, BROKEN, limits=ONE_ATTEMPT, retry_delay_us=0)
-                else:
-                    client.publish(held, {"points.ply": job.id.encode()})
-
-    thread = threading.Thread(target=work)
-    thread.start()
-    yield broken.update
-    ended.set()
-    thread.join()
 
 
 def run(client: Client, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: object) -> Any:
@@ -81,7 +44,7 @@ def test_a_map_and_its_next_version(
     out = tmp_path / "map"
     code, summary, said = run(client, monkeypatch, capsys, *drives, "--out", out, "--name", "Kreuzung")
     assert code == 0, said
-    assert {path: (out / path).read_bytes() for path in FILES} == FILES
+    assert {path: (out / path).read_bytes() for path in MAP_FILES} == MAP_FILES
     assert summary["version"] == 1
     assert summary["failed"] == [summary["drive_ids"][1]]
     assert summary["unconnected"] == ["d2"]
@@ -120,11 +83,11 @@ def test_a_folder_of_another_version(client: Client, connect: Connect, tmp_path:
     job = client.aggregate(drives=ids)
     for member in job["members"]:
         client.publish(client.claim(member["job_id"]), {"a": b"a"})
-    client.publish_map(client.claim(job["id"]), FILES)
+    client.publish_map(client.claim(job["id"]), MAP_FILES)
     library = connect(client)
     version = library.map_version(job["map_id"], 1)
     done = download(library, version, tmp_path / "out")
-    assert (done.files_received, done.files_skipped) == (len(FILES), 0)
+    assert (done.files_received, done.files_skipped) == (len(MAP_FILES), 0)
     other = version.model_copy(update={"number": 2})
     with pytest.raises(SceneFolderError, match="holds the map"):
         download(library, other, tmp_path / "out")
