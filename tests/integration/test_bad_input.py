@@ -141,6 +141,17 @@ def test_damaged_manifest(variant: Variant, mrasfm: Run, damage: Callable[[Docum
     assert words in refused(variant.save(), mrasfm)
 
 
+def test_exchanged_cameras(variant: Variant, mrasfm: Run) -> None:
+    """Left and right exchanged are the inverse in the axes of a camera, and front and back of a car that reverses."""
+    for frame in variant.document["frames"]:
+        left, right = frame["images"]["left"], frame["images"]["right"]
+        left["file"], right["file"] = right["file"], left["file"]
+    message = refused(variant.save(), mrasfm)
+    assert "rig_from_cam looks like its inverse" in message
+    assert "or the images of cameras left and right look exchanged" in message
+    assert "Exchange the files of left and right in all frames" in message
+
+
 @pytest.mark.slow
 def test_no_gnss_ignores_a_bad_receiver(variant: Variant, mrasfm: Run) -> None:
     gnss_on_gps_time(variant.document)

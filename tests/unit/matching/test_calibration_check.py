@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -170,3 +171,78 @@ def test_images_without_features_give_no_verdict() -> None:
 
 def test_a_single_camera_gives_no_verdict() -> None:
     check(make_simulated_drive(units=UNITS, cameras=1, points=800, given=inverted))
+
+
+def with_images_exchanged(simulated: SimulatedDrive, a: int, b: int) -> SimulatedDrive:
+    """The drive whose manifest lists the images of two cameras as each other's."""
+    images = simulated.drive.images
+    where = {(image.unit, image.camera): i for i, image in enumerate(images)}
+    other = {a: b, b: a}
+    taken = [where[image.unit, other.get(image.camera, image.camera)] for image in images]
+    return replace(simulated, features=[simulated.features[i] for i in taken])
+
+
+def across(*y_m: float) -> np.ndarray:
+    """Parallel forward cameras (c, 4, 4) at places across the vehicle."""
+    return se3.transform(np.tile(RECTIFIED[0, :3, :3], (len(y_m), 1, 1)), [[1.7, y, 1.5] for y in y_m])
+
+
+# KITTI's raw drives: a grey and a colour pair, 6 cm apart.
+GREY_AND_COLOUR = across(-0.31, -0.85, -0.25, -0.78)
+
+
+@pytest.mark.parametrize("exchanged", [(0, 1), (2, 3), (0, 3), (1, 2)])
+def test_exchanged_cameras_of_several_parallel_ones_are_refused_by_name(exchanged: tuple[int, int]) -> None:
+    """That of cameras 1 and 2 turns around nearly all baselines, as the inverse does."""
+    simulated = seen_by(GREY_AND_COLOUR, GREY_AND_COLOUR, low_m=(8.0, -12.0))
+    check(simulated)
+    a, b = exchanged
+    with pytest.raises(InputError, match=f"cameras camera{a} and camera{b} look exchanged: if they are") as caught:
+        check(with_images_exchanged(simulated, a, b))
+    assert caught.value.code == "cameras-exchanged"
+    assert f"Exchange the files of camera{a} and camera{b}" in caught.value.remedy
+
+
+def test_exchanged_cameras_of_a_stereo_pair_are_named_beside_the_inverse() -> None:
+    """Matches of two cameras do not tell one from the other."""
+    with pytest.raises(
+        InputError, match="its inverse, cam_from_rig, or the images of cameras camera0 and camera1"
+    ) as c:
+        check(with_images_exchanged(rectified_stereo(RECTIFIED), 0, 1))
+    assert "cam_from_rig" in c.value.what
+    assert "Exchange the files of camera0 and camera1" in c.value.remedy
+
+
+def test_exchanged_cameras_of_a_fan_are_named_beside_the_inverse_that_turns_it_around() -> None:
+    """In axes of a camera, the inverse of looking left is looking right."""
+    rig_from_cam = np.stack([looking(yaw_deg) for yaw_deg in (60.0, 0.0, -60.0)])
+    simulated = seen_by(rig_from_cam, rig_from_cam, low_m=(-45.0, -45.0))
+    check(simulated)
+    with pytest.raises(InputError, match="or the images of cameras camera0 and camera2 look exchanged"):
+        check(with_images_exchanged(simulated, 0, 2))
+
+
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("yaw_deg", [-5.0, -2.0, 2.0, 5.0])
+def test_parallel_cameras_that_are_turned_apart_are_neither_inverted_nor_exchanged(camera: int, yaw_deg: float) -> None:
+    """Far points seem to be behind them, and before them if each had the other one's place."""
+    true = RECTIFIED.copy()
+    true[camera, :3, :3] = se3.exp_so3(np.radians([0, 0, yaw_deg])) @ true[camera, :3, :3]
+    check(seen_by(true, RECTIFIED, low_m=(8.0, -12.0)))
+
+
+@pytest.mark.parametrize("yaw_deg", [-3.0, -0.3, 0.3, 3.0])
+@pytest.mark.parametrize("camera", [0, 3])
+def test_one_of_several_parallel_cameras_that_is_turned_is_not_exchanged(camera: int, yaw_deg: float) -> None:
+    true = GREY_AND_COLOUR.copy()
+    true[camera, :3, :3] = se3.exp_so3(np.radians([0, 0, yaw_deg])) @ true[camera, :3, :3]
+    check(seen_by(true, GREY_AND_COLOUR, low_m=(8.0, -12.0)))
+
+
+@pytest.mark.parametrize("off_deg", [-0.3, -0.1, 0.1, 0.3])
+def test_cameras_next_to_one_another_are_not_called_exchanged_by_noise(off_deg: float) -> None:
+    near = across(0.03, -0.03)
+    given = near.copy()
+    given[1, :3, :3] = se3.exp_so3(np.radians([0, 0, off_deg])) @ given[1, :3, :3]
+    check(seen_by(near, given, low_m=(15.0, -12.0)))
+    check(seen_by(given, near, low_m=(15.0, -12.0)))
