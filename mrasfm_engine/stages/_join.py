@@ -136,6 +136,7 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
     """Report of pairs across sub-maps and of those within each; pairs that two of them share were tried in both."""
     by_matches = sorted(reports, key=lambda report: -int(report["simultaneous"]["matches"]))
     contradictions = [report["contradiction"] for report in by_matches if report["contradiction"] is not None]
+    exchanged = [found for report in by_matches if (found := report.get("exchanged_cameras")) is not None]
     summed = _summed([{name: report[name] for name in _COUNTED} for report in reports])
     return {
         **summed,
@@ -144,6 +145,7 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
         "verified_matches": sum(int(pair.inliers.sum()) for pair in pairs),
         "simultaneous": by_matches[0]["simultaneous"],
         "contradiction": next(iter(contradictions), None),
+        "exchanged_cameras": next(iter(exchanged), None),
     }
 
 

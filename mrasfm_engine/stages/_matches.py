@@ -10,6 +10,7 @@ import numpy as np
 from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.io.stage_store import Arrays, StageWriter, StoredStage
 from mrasfm_engine.matching.contradicted_rig import require_images_as_listed
+from mrasfm_engine.matching.exchanged_by_motion import exchanged_by_motion
 from mrasfm_engine.matching.pair_choice import PairChoice
 from mrasfm_engine.matching.pair_matching import SearchResult, match_pairs
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -55,6 +56,7 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
             progress=run.step(Stage.MATCHES),
             cancel=run.cancel,
         )
+        exchanged = exchanged_by_motion(run.drive, found, result.pairs, cancel=run.cancel)
         require_images_as_listed(
             run.drive,
             found,
@@ -67,7 +69,10 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
             cancel=run.cancel,
         )
         write_pairs(stage, chosen.with_revisits(result.pairs))
-        return describe_matches(run.drive, result)
+        return {
+            **describe_matches(run.drive, result),
+            "exchanged_cameras": None if exchanged is None else as_json(exchanged),
+        }
 
     return run.large_stage(Stage.MATCHES, match_settings(run), work)
 
@@ -110,15 +115,15 @@ def describe_matches(drive: Drive, result: SearchResult) -> dict[str, Any]:
 
 
 def require_matches(run: Run, report: Mapping[str, Any]) -> None:
-    """Say what contradicts the calibration, and refuse a drive of which nothing matches.
+    """Say what contradicts the calibration or the cameras' names, and refuse a drive of which nothing matches.
 
     Raises
     ------
     ReconstructionError
         Where nothing matches.
     """
-    if report["contradiction"] is not None:
-        run.report["findings"].append(report["contradiction"])
+    findings = report["contradiction"], report.get("exchanged_cameras")  # stored reports may lack the latter
+    run.report["findings"] += [finding for finding in findings if finding is not None]
     if not report["verified_pairs"]:
         raise ReconstructionError(
             f"nothing matches: none of {report['candidate_pairs']} image pairs has a verified match",

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrasfm_engine.cli import main
+from mrasfm_engine.cli import EXIT_BAD_INPUT, main
 from mrasfm_engine.config import BundleAdjustmentConfig
 from schemas.artifacts import CHECKPOINTED
 from tests.integration.conftest import WITHOUT_PICTURES, CommandResult, Variant, read_report
@@ -76,3 +76,18 @@ def test_cameras_that_share_no_view_stay_where_they_were_given(shared_data: Path
     errors = json.loads(mrasfm("evaluate", scene, "--truth", drive / "truth.tum", "--json").out)
     assert errors["registered_images"] == errors["total_images"] == 78
     assert 0 < errors["metric"]["rmse_m"] < 0.02
+
+
+def test_exchanged_cameras_that_share_no_view_are_refused(mrasfm: Run, shared_data: Path, tmp_path: Path) -> None:
+    cameras = "front_left_camera,front_right_camera,right_camera"
+    drive, scene = tmp_path / "drive", tmp_path / "scene"
+    mrasfm("import", shared_data / "pandaset_002", "--frames", "30:38", "--cameras", cameras, "--out", drive)
+    document = json.loads((drive / "drive.json").read_text())
+    for frame in document["frames"]:
+        left, right = frame["images"]["front_left_camera"], frame["images"]["front_right_camera"]
+        left["file"], right["file"] = right["file"], left["file"]
+    (drive / "drive.json").write_text(json.dumps(document))
+    refused = mrasfm("reconstruct", drive, "--out", scene, *WITHOUT_PICTURES)
+    assert refused.code == EXIT_BAD_INPUT
+    assert "the images of cameras front_left_camera and front_right_camera look exchanged: in " in refused.err
+    assert not (scene / "report.json").exists()
