@@ -135,7 +135,10 @@ def _misread(
 ) -> InputError:
     """The error of a rig that other readings explain, with the exchanges of two cameras that do so as well."""
     name, code, _ = better[0].reading.value
-    sentences = [f"rig_from_cam looks like {name}", *(one.what(names) for one in exchanged)]
+    sentences = [
+        f"rig_from_cam looks like {name}",
+        *(f"the images of cameras {one.both(names)} look exchanged" for one in exchanged),
+    ]
     remedies = [*(one.reading.value[2] for one in better), *(one.remedy(names) for one in exchanged)]
     otherwise = "" if exchanged else " Check as well that no two cameras' images are swapped."
     return InputError(

@@ -34,7 +34,7 @@ from mrasfm_engine.matching.calibration_check import (
     MIN_INLIERS,
     MIN_PARALLAX_RAD,
 )
-from mrasfm_engine.matching.exchanged_cameras import CODE, Exchange, exchanged_error, exchanges
+from mrasfm_engine.matching.exchanged_cameras import Exchange, exchanged_error, exchanges
 from mrasfm_engine.matching.simultaneous import LARGEST_TURN_DEG, MIN_UNITS, SIGNIFICANT_SIGMAS, are_simultaneous
 from mrasfm_engine.matching.verification import epipolar_errors, parallax_rad, relative_pose
 from mrasfm_engine.scene.drive import Drive
@@ -129,8 +129,9 @@ def _likeliest(
 def _backwards(names: Sequence[str], exchange: Exchange, counted: str) -> Finding:
     """The finding on cameras that look aside and see the vehicle drive backwards."""
     return warning(
-        CODE,
-        f"frames: {exchange.what(names)}: {counted} the other way than the other cameras do",
+        "cameras-backwards",
+        f"frames: the images of cameras {exchange.both(names)} look exchanged: {counted} the other way than the other "
+        "cameras do",
         f"{exchange.remedy(names)} Nothing needs to be done where traffic that overtakes filled the images of both.",
     )
 

@@ -11,8 +11,6 @@ import numpy as np
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.types import Floats, Ints
 
-CODE = "cameras-exchanged"
-
 
 @dataclass(frozen=True)
 class Exchange:
@@ -32,14 +30,14 @@ class Exchange:
         result: Floats = rig_from_cam[self.taken_by(len(rig_from_cam))]
         return result
 
-    def what(self, names: Sequence[str]) -> str:
-        """The mistake, as the beginning of a sentence."""
-        return f"the images of cameras {names[self.camera_a]} and {names[self.camera_b]} look exchanged"
+    def both(self, names: Sequence[str]) -> str:
+        """The two cameras by name, as they stand in a sentence."""
+        return f"{names[self.camera_a]} and {names[self.camera_b]}"
 
     def remedy(self, names: Sequence[str]) -> str:
         """Sentence that says what to do."""
-        a, b = names[self.camera_a], names[self.camera_b]
-        return f"Exchange the files of {a} and {b} in all frames, or their entries in rig.cameras, whichever is wrong."
+        both = self.both(names)
+        return f"Exchange the files of {both} in all frames, or their entries in rig.cameras, whichever is wrong."
 
 
 def exchanges(cameras: int) -> Iterator[Exchange]:
@@ -49,4 +47,8 @@ def exchanges(cameras: int) -> Iterator[Exchange]:
 
 def exchanged_error(names: Sequence[str], exchange: Exchange, evidence: str) -> InputError:
     """The error of a drive whose images say so, with the evidence as the end of a sentence."""
-    return InputError(f"frames: {exchange.what(names)}: {evidence}", remedy=exchange.remedy(names), code=CODE)
+    return InputError(
+        f"frames: the images of cameras {exchange.both(names)} look exchanged: {evidence}",
+        remedy=exchange.remedy(names),
+        code="cameras-exchanged",
+    )

@@ -9,7 +9,7 @@ import pytest
 
 from mrasfm_engine.stages._matches import require_matches
 
-FOUND = {"code": "cameras-exchanged"}
+FOUND = {"code": "cameras-backwards"}
 
 
 @pytest.mark.parametrize(

@@ -181,7 +181,7 @@ def test_exchanged_cameras_that_look_aside_are_a_finding() -> None:
     """Both see the vehicle drive backwards, and traffic on both sides would look so as well."""
     finding = made(looking((0.0, 180.0, 90.0, -90.0)), exchanged=(2, 3)).check()
     assert finding is not None
-    assert (finding.severity, finding.code) == ("warning", "cameras-exchanged")
+    assert (finding.severity, finding.code) == ("warning", "cameras-backwards")
     assert "camera2 and camera3 look exchanged" in finding.what
     assert "the other way than the other cameras do" in finding.what
     assert "traffic" in finding.remedy
