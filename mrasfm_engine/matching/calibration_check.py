@@ -20,6 +20,7 @@ from mrasfm_engine.matching.exchanged_cameras import Exchange, exchanged_error, 
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.simultaneous import LARGEST_TURN_DEG
 from mrasfm_engine.matching.verification import (
+    direction_of_motion,
     epipolar_errors,
     essential_inliers,
     in_front_of_both,
@@ -91,15 +92,14 @@ def require_calibration_direction(
     if better:
         raise _misread(found.names, given_ok, better, exchanged)
     if exchanged:
-        best = max(exchanged, key=lambda one: found.worst_share(drive.rig_from_cam, one.taken_by(len(found.names))))
-        shares = [
-            found.worst_share(drive.rig_from_cam, taken_by) for taken_by in (best.taken_by(len(found.names)), None)
-        ]
+        cameras = len(found.names)
+        shares = [found.worst_share(drive.rig_from_cam, one.taken_by(cameras)) for one in exchanged]
+        best = int(np.argmax(shares))
         raise exchanged_error(
             found.names,
-            best,
-            f"if they are, simultaneous images of any two cameras fit rig.cameras by {shares[0]:.0%} of their matches "
-            f"and more, as given those of some by {shares[1]:.0%}",
+            exchanged[best],
+            f"if they are, simultaneous images of any two cameras fit rig.cameras by {shares[best]:.0%} of their "
+            f"matches and more, as given those of some by {found.worst_share(drive.rig_from_cam):.0%}",
         )
 
 
@@ -404,8 +404,4 @@ def _cosine(a: Floats, b: Floats) -> float:
 def _direction(rays_a: Floats, rays_b: Floats) -> Floats | None:
     """Direction from camera a to camera b: a unit vector."""
     found = relative_pose(rays_a, rays_b, max_error=MOTION_ERROR, confidence=0.999)
-    if found is None:
-        return None
-    rotation, translation = found
-    result: Floats = -(rotation.T @ translation)
-    return result
+    return None if found is None else direction_of_motion(found)

@@ -36,7 +36,7 @@ from mrasfm_engine.matching.calibration_check import (
 )
 from mrasfm_engine.matching.exchanged_cameras import Exchange, exchanged_error, exchanges
 from mrasfm_engine.matching.simultaneous import LARGEST_TURN_DEG, MIN_UNITS, SIGNIFICANT_SIGMAS, are_simultaneous
-from mrasfm_engine.matching.verification import epipolar_errors, parallax_rad, relative_pose
+from mrasfm_engine.matching.verification import direction_of_motion, epipolar_errors, parallax_rad, relative_pose
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.types import Cancel, Floats, Ints32
@@ -236,9 +236,8 @@ class _Motions:
         pose = relative_pose(*rays, max_error=self._max_error(taken_by), confidence=CONFIDENCE)
         if pose is None:
             return None
-        rotation, translation = pose
-        half_way = se3.exp_so3(0.5 * se3.log_so3(rotation))
-        result: Floats = -(self._rig[taken_by, :3, :3] @ half_way @ rotation.T @ translation)
+        half_way = se3.exp_so3(0.5 * se3.log_so3(pose[0]))
+        result: Floats = self._rig[taken_by, :3, :3] @ half_way @ direction_of_motion(pose)
         return result
 
     def _rays(self, motion: int, camera: int, taken_by: int, most: int = MAX_MATCHES) -> tuple[Floats, Floats]:
@@ -278,7 +277,7 @@ class _Motions:
         fit = epipolar_errors(se3.transform(*pose), *rays) < max_error
         result = [int(fit.sum()), int(fit.sum()), 0]
         for other in _by_plane(*rays, PLANE_ERROR * max_error):
-            if abs(_direction_of(pose) @ _direction_of(other)) < np.cos(np.radians(LARGEST_TURN_DEG)):
+            if abs(direction_of_motion(pose) @ direction_of_motion(other)) < np.cos(np.radians(LARGEST_TURN_DEG)):
                 other_fit = epipolar_errors(se3.transform(*other), *rays) < max_error
                 lost, won = int((fit & ~other_fit).sum()), int((other_fit & ~fit).sum())
                 if lost - won < result[1] - result[2]:
@@ -299,13 +298,6 @@ def _by_plane(rays_a: Floats, rays_b: Floats, max_error: float) -> list[tuple[Fl
         for rotation, translation in zip(rotations, translations, strict=True)
         if np.linalg.norm(translation) > 0.0
     ]
-
-
-def _direction_of(pose: tuple[Floats, Floats]) -> Floats:
-    """Direction (3,) from camera a to camera b, in the axes of a."""
-    rotation, translation = pose
-    result: Floats = -(rotation.T @ translation)
-    return result
 
 
 def _evenly_chosen(drive: Drive, pairs: Sequence[PairMatches]) -> list[dict[int, tuple[tuple[int, int], Ints32]]]:

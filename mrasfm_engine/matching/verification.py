@@ -50,6 +50,13 @@ def relative_pose(
     return np.asarray(rotation, dtype=np.float64), np.asarray(translation, dtype=np.float64).ravel()
 
 
+def direction_of_motion(pose: tuple[Floats, Floats]) -> Floats:
+    """Direction (3,) from camera a to camera b, in the axes of a, of a rotation and translation b_from_a."""
+    rotation, translation = pose
+    result: Floats = -(rotation.T @ translation)
+    return result
+
+
 def _plane_inliers(
     rays_a: Floats, rays_b: Floats, max_error: float, confidence: float = CONFIDENCE
 ) -> tuple[Bools, Floats | None]:
