@@ -191,7 +191,7 @@ def killed(role: Role, at_s: float, **known: Any) -> Kill:
 
 def test_kills_count_for_what_they_were(start_api: StartApi) -> None:
     client = start_api().client()
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     held = client.claim(job["id"])
     records = Records(client.api.settings.data_dir)
     before_s = time.time()

@@ -124,7 +124,7 @@ def test_a_deleted_drive_is_gone_and_its_scene_stays(client: Client) -> None:
 
 
 def test_a_drive_that_a_job_needs_is_not_deleted(client: Client) -> None:
-    drive_id = client.committed()
+    drive_id = client.frozen()
     job = client.reconstruct(drive_id)
     problem = problem_of(client.delete(f"/v1/drives/{drive_id}"), 409, "drive-in-use")
     assert job["id"] in problem["detail"]
@@ -286,7 +286,7 @@ def test_what_the_check_of_the_images_finds_is_shown(client: Client) -> None:
 
 
 def test_drives_by_the_state_of_their_check(client: Client) -> None:
-    still_open, pending, rejected, passed = client.create(), *(client.committed() for _ in range(3))
+    still_open, pending, rejected, passed = client.create(), *(client.frozen() for _ in range(3))
     with client.api.database.write() as session:
         session.get_one(Drive, rejected).preflight_state = PreflightState.REJECTED
         session.get_one(Drive, passed).preflight_state = PreflightState.PASSED

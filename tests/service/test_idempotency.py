@@ -53,7 +53,7 @@ def test_every_post_is_replayed(client: Client) -> None:
 
 
 def test_another_request_under_the_key_is_refused(client: Client) -> None:
-    drive_id = client.committed()
+    drive_id = client.frozen()
     job = client.reconstruct(drive_id, **KEY)
     other_body = client.post("/v1/reconstructions", json={"drive_id": drive_id, "settings": {"seed": 1}}, headers=KEY)
     problem_of(other_body, 422, "idempotency-key-reused")

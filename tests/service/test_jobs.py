@@ -32,7 +32,7 @@ BROKEN = Problem(type=PROBLEM_TYPE + "engine-abort", title="Aborted", detail="it
 
 @pytest.fixture(scope="module")
 def drive_id(owner: Client) -> str:
-    return owner.committed()
+    return owner.frozen()
 
 
 @pytest.fixture(scope="module")
@@ -160,7 +160,7 @@ def test_a_job_stalls_by_the_database_s_clock(postgres_api: Api, set_clock: Call
 
 def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
     client = api.client()
-    first, second = client.committed(), client.committed()
+    first, second = client.frozen(), client.frozen()
     made = [client.reconstruct(first)["id"] for _ in range(3)]
     client.reconstruct(second)
     page = client.get("/v1/jobs", params={"drive_id": first, "limit": 2}).json()
@@ -172,7 +172,7 @@ def test_jobs_are_listed_newest_first_and_by_drive(api: Api) -> None:
 
 def test_jobs_are_listed_by_state_and_kind(api: Api) -> None:
     client = api.client()
-    drive_id = client.committed()
+    drive_id = client.frozen()
     waits, runs, silent, broken = (
         client.reconstruct(drive_id, **{"Idempotency-Key": key})["id"] for key in ("waits", "runs", "silent", "broken")
     )
@@ -273,7 +273,7 @@ def test_a_failed_job_is_retried_as_a_new_one(owner: Client, job: dict[str, Any]
 
 
 def test_a_job_whose_drive_is_gone_is_not_retried(owner: Client) -> None:
-    drive_id = owner.committed()
+    drive_id = owner.frozen()
     job = owner.reconstruct(drive_id)
     owner.post(f"/v1/jobs/{job['id']}:cancel")
     owner.delete(f"/v1/drives/{drive_id}")
@@ -303,7 +303,7 @@ def test_retries_at_one_time_make_one_job(api: Api, owner: Client, job: dict[str
 
 
 def test_a_job_of_a_rejected_drive_is_not_retried(api: Api, owner: Client) -> None:
-    drive_id = owner.committed()
+    drive_id = owner.frozen()
     job = owner.reconstruct(drive_id)
     owner.post(f"/v1/jobs/{job['id']}:cancel")
     held = owner.claim(check_of(owner, drive_id)["preflight_job_id"])
@@ -318,7 +318,7 @@ def test_a_job_of_a_rejected_drive_is_not_retried(api: Api, owner: Client) -> No
 
 def test_a_retried_job_is_kept_as_long_as_a_new_one(start_api: StartApi) -> None:
     client = start_api(job_retention_days=1).client()
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     client.post(f"/v1/jobs/{job['id']}:cancel")
     with client.api.database.write() as session:
         session.get_one(Job, job["id"]).expires_us = now_us() + 1_000_000
@@ -328,7 +328,7 @@ def test_a_retried_job_is_kept_as_long_as_a_new_one(start_api: StartApi) -> None
 
 def test_the_quota_of_jobs(api: Api) -> None:
     client = api.client(max_active_jobs=1)
-    drive_id = client.committed()
+    drive_id = client.frozen()
     job = client.reconstruct(drive_id)
     answer = client.post("/v1/reconstructions", json={"drive_id": drive_id})
     problem_of(answer, 429, "too-many-jobs")
@@ -341,7 +341,7 @@ def test_the_quota_of_jobs(api: Api) -> None:
 def test_a_heartbeat_changes_nothing_that_an_index_has(postgres_api: Api) -> None:
     """Else PostgreSQL writes to all indexes of the table each second of each running job, and has to vacuum them."""
     client, database = postgres_api.client(), postgres_api.database
-    job_id = client.reconstruct(client.committed())["id"]
+    job_id = client.reconstruct(client.frozen())["id"]
     with database.write() as session:
         held = jobs.claim(session, job_id, owner="w", lease_us=LEASE_US)
         assert held is not None
@@ -370,7 +370,7 @@ def test_the_quota_of_jobs_is_counted_without_thejob_history(api: Api) -> None:
 def test_a_project_without_space_gets_no_jobs(api: Api) -> None:
     """What jobs make may exceed the quota: so none begins where it is used up."""
     client = api.client(max_active_jobs=2)
-    drive_id = client.committed()
+    drive_id = client.frozen()
     job = client.reconstruct(drive_id)
     client.post(f"/v1/jobs/{job['id']}:cancel")
     with client.api.database.write() as session:
@@ -390,7 +390,7 @@ def check_of(client: Client, drive_id: str) -> dict[str, Any]:
 
 def test_a_drive_has_one_check_at_a_time(api: Api) -> None:
     client = api.client(max_active_jobs=1)
-    drive_id = client.committed()
+    drive_id = client.frozen()
     first = check_of(client, drive_id)["preflight_job_id"]
     client.post(f"/v1/jobs/{first}:cancel")
     statuses: list[int] = []
@@ -415,7 +415,7 @@ def test_a_drive_has_one_check_at_a_time(api: Api) -> None:
 @pytest.mark.parametrize(("sound", "result"), [(True, "PASSED"), (False, "REJECTED")])
 def test_a_drive_that_was_checked_is_not_checked_again(api: Api, sound: bool, result: str) -> None:
     client = api.client()
-    drive_id = client.committed()
+    drive_id = client.frozen()
     first = check_of(client, drive_id)["preflight_job_id"]
     client.post(f"/v1/jobs/{first}:cancel")
     second = client.post(f"/v1/jobs/{first}:retry").json()["id"]
@@ -428,7 +428,7 @@ def test_a_drive_that_was_checked_is_not_checked_again(api: Api, sound: bool, re
 
 def test_the_last_place_is_taken_once(api: Api) -> None:
     client = api.client(max_active_jobs=1)
-    drive_id = client.committed()
+    drive_id = client.frozen()
     statuses: list[int] = []
 
     def ask() -> None:
@@ -518,7 +518,7 @@ def test_events_come_as_they_happen(owner: Client, job: dict[str, Any]) -> None:
 
 def test_events_end_with_the_key(api: Api) -> None:
     client = api.client()
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     with client.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
         lines = answer.iter_lines()
         assert any("QUEUED" in line for line in lines)

@@ -213,7 +213,7 @@ def test_a_download_goes_on_while_the_scene_is_deleted(api: Api) -> None:
 
 def test_scenes_are_listed_newest_first(api: Api) -> None:
     client = api.client()
-    drive_id = client.committed()
+    drive_id = client.frozen()
     made = [client.publish(client.claim(client.reconstruct(drive_id)["id"]), {"a": b"a"}) for _ in range(3)]
     first = client.get("/v1/scenes", params={"limit": 2, "drive_id": drive_id}).json()
     second = client.get("/v1/scenes", params={"limit": 2, "cursor": first["next"]}).json()
@@ -223,7 +223,7 @@ def test_scenes_are_listed_newest_first(api: Api) -> None:
 
 
 def test_a_publication_of_an_old_holder_is_not_seen(client: Client) -> None:
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     old = client.claim(job["id"])
     with client.api.database.write() as session:
         jobs.release(session, old)

@@ -486,7 +486,7 @@ def test_an_upload_that_goes_on_while_it_is_swept(tmp_path: Path) -> None:
 
 
 def test_a_committed_drive_takes_none(client: Client) -> None:
-    problem_of(create(client, client.committed(), 5, path=PATH), 409, "drive-committed")
+    problem_of(create(client, client.frozen(), 5, path=PATH), 409, "drive-committed")
 
 
 def test_refused_requests(client: Client, api: Api) -> None:

@@ -78,7 +78,7 @@ def test_jobs_that_end_leave_one_message_each(client: Client) -> None:
 
 def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
     made = register(client)
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
 
     def cancel_and_fail(session: Session) -> None:
         jobs.request_cancel(session, job["id"])
@@ -91,7 +91,7 @@ def test_a_message_is_rolled_back_with_its_transaction(client: Client) -> None:
 
 def secrets_of_message(client: Client, webhook_id: str) -> list[str]:
     """The secrets that sign a message now."""
-    client.post(f"/v1/jobs/{client.reconstruct(client.committed())['id']}:cancel")
+    client.post(f"/v1/jobs/{client.reconstruct(client.frozen())['id']}:cancel")
     with client.api.database.write() as session:
         (taken,) = [message for message in webhooks.take(session, limit=100) if message.webhook_id == webhook_id]
         webhooks.note(session, taken, webhooks.Outcome(status=204))

@@ -31,7 +31,7 @@ class Shop:
 
     def __init__(self, client: Client) -> None:
         self.client = client
-        self._drive_id = client.committed(tiny_drive(seed="shop"))
+        self._drive_id = client.frozen(tiny_drive(seed="shop"))
 
     def scene(self, files: dict[str, bytes]) -> str:
         job = self.client.reconstruct(self._drive_id)

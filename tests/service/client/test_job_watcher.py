@@ -23,7 +23,7 @@ from tests.service.client.conftest import Connect
 @pytest.fixture
 def job_id(client: Client) -> str:
     """A job that waits."""
-    return str(client.reconstruct(client.committed(tiny_drive(seed="follow")))["id"])
+    return str(client.reconstruct(client.frozen(tiny_drive(seed="follow")))["id"])
 
 
 @contextmanager

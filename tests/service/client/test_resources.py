@@ -99,7 +99,7 @@ def test_an_export_is_asked_for_and_downloaded(client: Owner, connect: Connect, 
 def test_webhooks_are_registered_and_rotated(client: Owner, connect: Connect) -> None:
     library = connect(client)
     made = library.create_webhook(WebhookRequest(url="https://example.org/", events=[WebhookEvent.JOB_CANCELLED]))
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     library.cancel_job(job["id"])
     (message,) = library.deliveries(made.id)
     assert message.job_id == job["id"]
@@ -123,7 +123,7 @@ def test_the_same_in_an_event_loop(client: Owner, tmp_path: Path) -> None:
             assert done.files_received == 1
             with pytest.raises(ApiError):
                 await library.drive("drv_0")
-            waiting = asyncio.create_task(library.call(watch_job, client.reconstruct(client.committed())["id"]))
+            waiting = asyncio.create_task(library.call(watch_job, client.reconstruct(client.frozen())["id"]))
             await asyncio.sleep(0.2)
             assert not waiting.done()
             library.stop()
@@ -154,7 +154,7 @@ def test_a_list_of_jobs_says_which_drive_and_why(
 ) -> None:
     monkeypatch.setenv("MRASFM_API_KEY", client.key)
     monkeypatch.setenv("MRASFM_URL", client.api.url)
-    drive_ids = [client.committed() for _ in range(3)]
+    drive_ids = [client.frozen() for _ in range(3)]
     failed, runs, waits = (client.reconstruct(drive_id)["id"] for drive_id in drive_ids)
     held, running = client.claim(failed), client.claim(runs)
     detail = "no image of the drive has a keypoint"
@@ -198,7 +198,7 @@ def test_a_list_of_drives_says_what_their_check_found(
     warned = {"severity": "warning", "code": "dark", "what": "an image is dark", "remedy": "Look."}
     wrong = {**warned, "severity": "error"}
     client.create()
-    drive_ids = [client.committed() for _ in range(6)]
+    drive_ids = [client.frozen() for _ in range(6)]
     with client.api.database.write() as session:
         for drive_id, state, findings in zip(
             drive_ids,
@@ -266,7 +266,7 @@ def test_commands(
     assert run(client, capsys, "delete", export["id"])[0] == 0
     other = run(client, capsys, "export", scene_id, "--format", "kitti", "--out", str(tmp_path / "scene"))
     assert (other[0], f"holds the scene {scene_id}" in other[1]["error"]) == (2, True), "before the wait"
-    job = client.reconstruct(client.committed())
+    job = client.reconstruct(client.frozen())
     assert run(client, capsys, "cancel", job["id"])[1]["job_state"] == "CANCELLED"
     assert run(client, capsys, "wait", job["id"])[0] == 3
     only = ("--kind", "RECONSTRUCTION", "--state", "CANCELLED", "--state", "FAILED")
