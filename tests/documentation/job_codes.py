@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -103,20 +103,31 @@ def _severities(found: Sequence[Use], code: str) -> str:
     return ", ".join(sorted({use.severity for use in found if use.code == code and use.severity}))
 
 
-@cache
 def uses() -> tuple[Use, ...]:
     """All places that give a code, in the order of the sources."""
-    return (*(use for path in source_files() for use in _uses_in(_tree(path))), *_of_tables())
+    return (*_read_sources()[0], *_of_tables())
 
 
-def unresolved() -> list[str]:
+def unresolved() -> tuple[str, ...]:
     """Expressions that give a code and are neither a text nor known to pass one on."""
-    return [
-        f"{path.relative_to(REPOSITORY)}:{given.lineno}: {ast.unparse(given)}"
-        for path in source_files()
-        for _, given in _given(_tree(path))
-        if not isinstance(given, ast.Constant) and ast.unparse(given) not in PASSED_ON | EPSG_CODES
-    ]
+    return _read_sources()[1]
+
+
+@cache
+def _read_sources() -> tuple[tuple[Use, ...], tuple[str, ...]]:
+    """What `uses` and `unresolved` find: to parse the sources takes seconds, and their trees would stay in memory."""
+    found: list[Use] = []
+    unknown = []
+    for path in source_files():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        given = list(_given(tree))
+        found += _uses_in(tree, given)
+        unknown += [
+            f"{path.relative_to(REPOSITORY)}:{expression.lineno}: {ast.unparse(expression)}"
+            for _, expression in given
+            if not isinstance(expression, ast.Constant) and ast.unparse(expression) not in PASSED_ON | EPSG_CODES
+        ]
+    return tuple(found), tuple(unknown)
 
 
 def source_files() -> Iterator[Path]:
@@ -127,20 +138,17 @@ def source_files() -> Iterator[Path]:
                 yield path
 
 
-def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
 def _given(tree: ast.Module) -> Iterator[tuple[ast.Call, ast.expr]]:
     """Calls that give a code, with the expression of it: by its name, or in the place of a parameter of this name."""
     places = dict.fromkeys((*FINDINGS, *EITHER), 0)
-    for node in ast.walk(tree):
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef | ast.Call)]
+    for node in nodes:
         if isinstance(node, ast.FunctionDef):
             names = [argument.arg for argument in node.args.args]
             if "code" in names:
                 places[node.name] = names.index("code")
-    for node in ast.walk(tree):
-        if not isinstance(node, ast.Call) or ast.unparse(node.func).startswith("log."):
+    for node in nodes:
+        if not isinstance(node, ast.Call) or _is_of_log(node.func):
             continue
         named = {keyword.arg: keyword.value for keyword in node.keywords}
         place = places.get(_name(node))
@@ -152,8 +160,12 @@ def _given(tree: ast.Module) -> Iterator[tuple[ast.Call, ast.expr]]:
             yield node, typed.right
 
 
-def _uses_in(tree: ast.Module) -> Iterator[Use]:
-    for call, given in _given(tree):
+def _is_of_log(function: ast.expr) -> bool:
+    return isinstance(function, ast.Attribute) and isinstance(function.value, ast.Name) and function.value.id == "log"
+
+
+def _uses_in(tree: ast.Module, given_in_tree: Iterable[tuple[ast.Call, ast.expr]]) -> Iterator[Use]:
+    for call, given in given_in_tree:
         if isinstance(given, ast.Constant) and _CODE.fullmatch(str(given.value)):
             name = _name(call)
             severities = FINDINGS if name in EITHER else (name if name in FINDINGS else "",)

@@ -36,6 +36,14 @@ OLD_BEGINNINGS = ("judge_", "settle_", "settled_", "_settle", "_way")
 ROOMS = {("mrasfm_engine/config.py", "matching")}
 
 
+@pytest.fixture(autouse=True, scope="module")
+def _forget_trees() -> Iterator[None]:
+    """Leave no million of nodes to the garbage collector, which would look through them in all later tests."""
+    yield
+    _trees.cache_clear()
+    _nodes.cache_clear()
+
+
 @cache
 def _trees() -> dict[str, ast.Module]:
     paths = [path for package in PACKAGES for path in (REPOSITORY / package).rglob("*.py")]

@@ -14,7 +14,7 @@ REPOSITORY = Path(__file__).resolve().parents[3]
 
 
 def test_no_code_is_given_in_a_way_that_the_list_does_not_see() -> None:
-    assert job_codes.unresolved() == []
+    assert job_codes.unresolved() == ()
 
 
 @pytest.mark.parametrize(
