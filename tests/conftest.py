@@ -9,7 +9,7 @@ import platform
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -124,6 +124,24 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(
         key=lambda item: (item.path in needing, _is_below(item.path, (_CONSOLE,)), not _is_below(item.path, _LONG))
     )
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect in one test process before the others where sources have changed.
+
+    All of them collect all tests. The first one leaves bytecode of the tests, with their rewritten assertions, which
+    takes twice as long as to collect them.
+    """
+    path = os.environ.get(_KERNEL_LOCK) if "PYTEST_XDIST_WORKER" in os.environ else None
+    if path is None:
+        return (yield)
+    with open(f"{path}.collection", "w") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            fcntl.flock(lock, fcntl.LOCK_SH)
+        return (yield)
 
 
 def pytest_collection_finish() -> None:
