@@ -23,19 +23,13 @@ def _wait_for(path: Path, seconds: float = 120.0) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize(
-    ("number", "code"),
-    [(signal.SIGINT, EXIT_INTERRUPTED), (signal.SIGTERM, EXIT_TERMINATED)],
-    ids=["SIGINT", "SIGTERM"],
-)
-def test_interrupted_run_resumes(variant: Variant, mrasfm: Run, number: int, code: int) -> None:
+def _stopped(variant: Variant, number: int, code: int, *, meanwhile: Callable[[], None] = lambda: None) -> None:
+    """Send a signal to a run whose features are stored, and look at how it ends."""
     variant.keep(cameras=["front", "left"], units=5).save()
     process = mrasfm_process("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     _wait_for(variant.scene / ".stages" / "features.npz")
     process.send_signal(signal.SIGSTOP)  # it does not end meanwhile
-    beside = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
-    assert beside.code == EXIT_BAD_INPUT
-    assert f"another run is making a result in {variant.scene}" in beside.err
+    meanwhile()
     process.send_signal(signal.SIGCONT)
     process.send_signal(number)
     _, errors = process.communicate(timeout=60)
@@ -46,11 +40,25 @@ def test_interrupted_run_resumes(variant: Variant, mrasfm: Run, number: int, cod
     assert "cancelled" in errors
     assert {path.name for path in variant.scene.iterdir()} == {".stages"}
     assert leftovers(variant.scene.parent) == []
+
+
+def test_interrupted_run_resumes(variant: Variant, mrasfm: Run) -> None:
+    def run_beside() -> None:
+        beside = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
+        assert beside.code == EXIT_BAD_INPUT
+        assert f"another run is making a result in {variant.scene}" in beside.err
+
+    _stopped(variant, signal.SIGINT, EXIT_INTERRUPTED, meanwhile=run_beside)
     result = mrasfm("reconstruct", variant.root, "--out", variant.scene, *WITHOUT_PICTURES)
     assert result.code == 0
     stages = read_report(variant.scene)["by_stage"]
     assert stages["features"]["reused"]
     assert not stages["mapping"]["reused"]
+
+
+def test_terminated_run_leaves_finished_stages(variant: Variant) -> None:
+    """What the next run does with them is as after an interrupt."""
+    _stopped(variant, signal.SIGTERM, EXIT_TERMINATED)
 
 
 def _small_files() -> None:

@@ -302,7 +302,7 @@ def test_names_for_the_same_file(unpacked: Unpacker, pack: Pack, first: str, sec
     unpacked.refused(archive, "unsafe-archive", word)
 
 
-@pytest.mark.parametrize(("kind", "entries"), [("zip stored", 100_000), ("tar gzip", 1_001)])
+@pytest.mark.parametrize(("kind", "entries"), [("zip stored", 20_000), ("tar gzip", 1_001)])
 def test_too_many_entries(unpacked: Unpacker, kind: str, entries: int) -> None:
     archive = PACKERS[kind]((f"front/{i}.png", png()) for i in range(entries))
     unpacked.refused(archive, "archive-too-large", "entries, the bound is 1000")

@@ -29,6 +29,7 @@ from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose, pose_from_matrix
 from mrasfm_engine.synthetic import small_options
 from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER, render_drives
+from tests.helpers.painted_once import textures_painted_once
 
 UNITS = 24
 SMALL = {"cameras": 1, "units": UNITS, "texture_px": 128, "masks": False}
@@ -38,14 +39,16 @@ SMALL = {"cameras": 1, "units": UNITS, "texture_px": 128, "masks": False}
 def with_bonnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One camera that sees a bonnet, on 25 m of way."""
     out = tmp_path_factory.mktemp("synth") / "bonnet"
-    render_drives(small_options(own_car=True, **SMALL), out)
+    with textures_painted_once():
+        render_drives(small_options(own_car=True, **SMALL), out)
     return out
 
 
 @pytest.fixture(scope="module")
 def without_bonnet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("synth") / "plain"
-    render_drives(small_options(**SMALL), out)
+    with textures_painted_once():
+        render_drives(small_options(**SMALL), out)
     return out
 
 

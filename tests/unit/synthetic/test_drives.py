@@ -3,6 +3,7 @@
 import argparse
 import json
 import shutil
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from mrasfm_engine.synthetic.own_car import UNLABELLED
 from mrasfm_engine.synthetic.rigs import TrueCamera, mounts, true_cameras
 from mrasfm_engine.synthetic.streets import lay_out
 from schemas import DriveManifest, Pose, SemanticClass
+from tests.helpers.painted_once import textures_painted_once
 from tests.helpers.slow import slow
 
 TINY = {"units": 2, "width": 320, "height": 180, "texture_px": 128}
@@ -43,6 +45,12 @@ def poses_of(options: SynthOptions, drive: int = 0) -> np.ndarray:
 
 def cameras_of(count: int = 6) -> list[TrueCamera]:
     return true_cameras(count, width=320, height=180, rng=np.random.default_rng(0))
+
+
+@pytest.fixture
+def painted_once() -> Iterator[None]:
+    with textures_painted_once():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -164,6 +172,7 @@ def test_same_seed_same_files_other_seed_others(tmp_path: Path) -> None:
         assert a != c
 
 
+@pytest.mark.usefixtures("painted_once")
 def test_nothing_is_overwritten_without_force(drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "drive"
     out.mkdir()
@@ -194,6 +203,7 @@ def test_force_spares_a_folder_that_is_no_drive(tmp_path: Path, name: str) -> No
     assert own.is_file()
 
 
+@pytest.mark.usefixtures("painted_once")
 def test_force_spares_what_lies_among_several_drives(tmp_path: Path) -> None:
     out = tmp_path / "drives"
     options = small_options(**TINY, cameras=1, masks=False, drives=2)
@@ -207,6 +217,7 @@ def test_force_spares_what_lies_among_several_drives(tmp_path: Path) -> None:
     assert (out / "drive_1" / "drive.json").is_file()
 
 
+@pytest.mark.usefixtures("painted_once")
 def test_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     def fail(done: int, total: int) -> None:
         raise KeyboardInterrupt
@@ -216,6 +227,7 @@ def test_failure_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("painted_once")
 def test_difficulties_show_in_the_manifest(tmp_path: Path) -> None:
     out = tmp_path / "drive"
     render_drives(
