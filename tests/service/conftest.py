@@ -118,11 +118,12 @@ def _run(*command: str | Path, cwd: Path) -> None:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_settings(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Settings]:
-    """Settings of an empty database, of either kind."""
+    """Settings of an empty database, of either kind; of a migrated one for who asks for `database` as well."""
     if request.param == "sqlite":
         yield settings_of(tmp_path)
         return
-    with _postgres_database(request.getfixturevalue("postgres_url")) as url:
+    template = request.getfixturevalue("postgres_template") if "database" in request.fixturenames else ""
+    with _postgres_database(request.getfixturevalue("postgres_url"), template) as url:
         yield settings_of(tmp_path, database_url=url)
 
 
@@ -142,10 +143,10 @@ def postgres_template(postgres_url: str) -> Iterator[str]:
 
 
 @contextmanager
-def _postgres_database(server: str) -> Iterator[str]:
-    """URL of an empty database."""
+def _postgres_database(server: str, template: str = "") -> Iterator[str]:
+    """URL of a database that is empty, or the copy of another one."""
     name = new_id("t")
-    _on_server(server, f'CREATE DATABASE "{name}"')
+    _on_server(server, f'CREATE DATABASE "{name}"' + (f' TEMPLATE "{template}"' if template else ""))
     yield make_url(server).set(database=name).render_as_string(hide_password=False)
     _on_server(server, f'DROP DATABASE "{name}" WITH (FORCE)')
 
@@ -158,14 +159,9 @@ def _on_server(url: str, statement: str) -> None:
 
 
 @pytest.fixture
-def database(database_settings: Settings, request: pytest.FixtureRequest) -> Iterator[Database]:
+def database(database_settings: Settings) -> Iterator[Database]:
     """A migrated database, of either kind."""
-    url = make_url(database_settings.resolved_database_url)
-    if url.get_backend_name() == "postgresql":
-        template, server = request.getfixturevalue("postgres_template"), request.getfixturevalue("postgres_url")
-        _on_server(server, f'DROP DATABASE "{url.database}"')
-        _on_server(server, f'CREATE DATABASE "{url.database}" TEMPLATE "{template}"')
-    else:
+    if make_url(database_settings.resolved_database_url).get_backend_name() == "sqlite":
         migrated(database_settings)
     opened = Database.from_settings(database_settings)
     yield opened
