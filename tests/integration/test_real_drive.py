@@ -87,7 +87,9 @@ def test_exchanged_cameras_that_share_no_view_are_refused(mrasfm: Run, shared_da
         left, right = frame["images"]["front_left_camera"], frame["images"]["front_right_camera"]
         left["file"], right["file"] = right["file"], left["file"]
     (drive / "drive.json").write_text(json.dumps(document))
-    refused = mrasfm("reconstruct", drive, "--out", scene, *WITHOUT_PICTURES)
+    config = tmp_path / "config.toml"
+    config.write_text("features = {max_side_px = 960, max_keypoints = 2000}")  # of half the size: it shows as well
+    refused = mrasfm("reconstruct", drive, "--out", scene, "--config", config)
     assert refused.code == EXIT_BAD_INPUT
     assert "the images of cameras front_left_camera and front_right_camera look exchanged: in " in refused.err
     assert not (scene / "report.json").exists()
