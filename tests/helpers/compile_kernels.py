@@ -19,11 +19,12 @@ WITHOUT_PICTURES = Path(__file__).parents[1] / "integration" / "without_pictures
 
 def compile_kernels(folder: Path) -> None:
     """Run the commands on drives that are as small as they may be."""
-    options = ("--cameras", "3", "--units", "8", "--width", "320", "--height", "180")
+    options = ("--cameras", "3", "--units", "6", "--width", "320", "--height", "180", "--texture-px", "128")
     drives, scenes = folder / "drives", [folder / "a", folder / "b"]
     _run("synth", "--out", drives, "--drives", "2", *options)
-    for drive, scene in zip(sorted(path.parent for path in drives.glob("*/drive.json")), scenes, strict=True):
-        _run("reconstruct", drive, "--out", scene)
+    first, second = sorted(path.parent for path in drives.glob("*/drive.json"))
+    _run("reconstruct", first, "--out", scenes[0])
+    _run("reconstruct", second, "--out", scenes[1], "--config", WITHOUT_PICTURES)
     _run("aggregate", *scenes, "--out", folder / "map")
     apart = folder / "apart"
     _run("synth", "--out", apart, "--time-skew-ms", "40", "--cameras", "2", "--units", "6", *options[4:])
