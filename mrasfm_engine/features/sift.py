@@ -9,6 +9,7 @@ from mrasfm_engine.config import FeatureConfig
 from mrasfm_engine.features.coverage import covering_order
 from mrasfm_engine.features.extraction import DESCRIPTOR_SCALE, NO_FEATURES, colors_at
 from mrasfm_engine.features.extraction_size import largest_side_px, shrunk
+from mrasfm_engine.features.sift_descriptors import sift_descriptors
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes
@@ -18,7 +19,7 @@ CANDIDATES = 2  # times the number wanted, of which those are chosen that cover 
 
 
 class SiftExtractor:
-    """OpenCV's SIFT with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012)."""
+    """OpenCV's SIFT keypoints with RootSIFT descriptors (Arandjelovic and Zisserman, CVPR 2012)."""
 
     def __init__(self, config: FeatureConfig) -> None:
         self._config = config
@@ -35,21 +36,16 @@ class SiftExtractor:
     def extract(self, rgb: Bytes, mask: Bools | None) -> ImageFeatures:
         """See `Extractor`."""
         gray, small_mask, sift = self._prepared(rgb, mask)
-        keypoints, descriptors = sift.detectAndCompute(gray, small_mask)
+        keypoints = sorted(sift.detect(gray, small_mask), key=lambda k: -k.response)
         if not keypoints:
             return NO_FEATURES
-        order = np.argsort([-k.response for k in keypoints], kind="stable")
         if self._config.spread:
-            order = order[covering_order(np.array([keypoints[i].pt for i in order], np.float32))]
-        order = order[: self._config.max_keypoints]
+            keypoints = [keypoints[i] for i in covering_order(cv2.KeyPoint.convert(keypoints))]
+        keypoints = keypoints[: self._config.max_keypoints]
         # OpenCV puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
-        xy = (np.array([keypoints[i].pt for i in order]) + 0.5) / (
-            gray.shape[1] / rgb.shape[1],
-            gray.shape[0] / rgb.shape[0],
-        )
-        root = np.sqrt(
-            descriptors[order] / np.maximum(descriptors[order].sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM)
-        )
+        xy = (cv2.KeyPoint.convert(keypoints) + 0.5) / np.divide(gray.shape[::-1], rgb.shape[1::-1])
+        descriptors = sift_descriptors(gray, keypoints)
+        root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM))
         return ImageFeatures(
             xy_px=xy.astype(np.float32),
             descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
