@@ -118,12 +118,9 @@ def _extrema(differences: Any, threshold: Any) -> Any:
             _mark(differences[level, row - 1], threshold, highest, lowest, is_extremum)
             added = _marked(is_extremum, columns)
             if count + added > len(result):
-                larger = np.empty((2 * (count + added), 3), np.int32)
-                larger[:count] = result[:count]
-                result = larger
-            result[count : count + added, 0] = level
-            result[count : count + added, 1] = row - 1
-            result[count : count + added, 2] = columns[:added]
+                result = np.concatenate((result, np.empty((len(result) + added, 3), np.int32)))
+            for k in range(added):
+                result[count + k, 0], result[count + k, 1], result[count + k, 2] = level, row - 1, columns[k]
             count += added
     return result[:count]
 
@@ -215,14 +212,14 @@ def _directions(magnitude: Any, direction: Any, places: Any) -> Any:
         _add_gradients(magnitude, direction, places[k], weights, added)
         added[0] += added[DIRECTIONS]
         added[1] += added[DIRECTIONS + 1]
-        raw = added[:DIRECTIONS]
+        raw, highest = added[:DIRECTIONS], 0.0
         for d in range(DIRECTIONS):
             neighbours, next_ones = raw[d - 1] + raw[(d + 1) % DIRECTIONS], raw[d - 2] + raw[(d + 2) % DIRECTIONS]
             histogram[d] = (6.0 * raw[d] + 4.0 * neighbours + next_ones) / 16.0
-        least = PEAK * histogram.max()
+            highest = max(highest, histogram[d])
         for d in range(DIRECTIONS):
             before, here, after = histogram[d - 1], histogram[d], histogram[(d + 1) % DIRECTIONS]
-            if here > before and here > after and here >= least:
+            if here > before and here > after and here >= PEAK * highest:
                 top = d + 0.5 * (before - after) / (before - 2.0 * here + after)
                 rows[count], result[count] = k, (top % DIRECTIONS) * 2.0 * math.pi / DIRECTIONS
                 count += 1
