@@ -8,6 +8,7 @@ chosen, and an object of Python for each keypoint.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,9 +58,16 @@ class Keypoints:
 
     def chosen(self, rows: Any) -> Keypoints:
         """Keypoints that an index or a mask chooses."""
-        return Keypoints(
-            self.xy_px[rows], self.sigma_px[rows], self.contrast[rows], self.level[rows], self.direction_rad[rows]
-        )
+        return Keypoints(*(column[rows] for column in self._columns()))
+
+    @staticmethod
+    def joined(parts: Sequence[Keypoints]) -> Keypoints:
+        """Keypoints of all parts, in their order."""
+        nothing = Keypoints(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
+        return Keypoints(*map(np.concatenate, zip(*(part._columns() for part in (nothing, *parts)), strict=True)))
+
+    def _columns(self) -> tuple[Floats, Floats, Floats, Ints, Floats]:
+        return self.xy_px, self.sigma_px, self.contrast, self.level, self.direction_rad
 
 
 @njit(cache=True, nogil=True, fastmath={"contract", "nnan", "nsz"})
@@ -126,6 +134,34 @@ def _extrema(differences: Any, threshold: Any) -> Any:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _newton_step(here: Any) -> Any:
+    """Level, row and column from the middle of values (3, 3, 3) to the extremum of a parabola, and its value.
+
+    Also whether it lies on a corner, and not on an edge. A flat place leads to infinity, or to what is not a number.
+    """
+    value = float(here[1, 1, 1])
+    gx = (here[1, 1, 2] - here[1, 1, 0]) / 2.0
+    gy = (here[1, 2, 1] - here[1, 0, 1]) / 2.0
+    gs = (here[2, 1, 1] - here[0, 1, 1]) / 2.0
+    xx = here[1, 1, 2] + here[1, 1, 0] - 2.0 * value
+    yy = here[1, 2, 1] + here[1, 0, 1] - 2.0 * value
+    ss = here[2, 1, 1] + here[0, 1, 1] - 2.0 * value
+    xy = (here[1, 2, 2] - here[1, 2, 0] - here[1, 0, 2] + here[1, 0, 0]) / 4.0
+    xs = (here[2, 1, 2] - here[2, 1, 0] - here[0, 1, 2] + here[0, 1, 0]) / 4.0
+    ys = (here[2, 2, 1] - here[2, 0, 1] - here[0, 2, 1] + here[0, 0, 1]) / 4.0
+    # by the cofactors of the symmetric matrix of second derivatives
+    c_xx, c_xy, c_xs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
+    c_yy, c_ys, c_ss = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
+    determinant = xx * c_xx + xy * c_xy + xs * c_xs
+    dx = -(c_xx * gx + c_xy * gy + c_xs * gs) / determinant
+    dy = -(c_xy * gx + c_yy * gy + c_ys * gs) / determinant
+    ds = -(c_xs * gx + c_ys * gy + c_ss * gs) / determinant
+    # of the curvatures along and across: their ratio r has (r + 1)^2 / r = trace^2 / determinant
+    is_corner = c_ss > 0.0 and (xx + yy) ** 2 * EDGE_RATIO < (EDGE_RATIO + 1.0) ** 2 * c_ss
+    return (ds, dy, dx), value + 0.5 * (gx * dx + gy * dy + gs * ds), is_corner
+
+
+@njit(cache=True, nogil=True)
 def _between_pixels(differences: Any, extrema: Any, least: float) -> Any:
     """Level, row and column (k, 3) of extrema, what is to be added to each (k, 3), and their absolute values (k,).
 
@@ -137,44 +173,24 @@ def _between_pixels(differences: Any, extrema: Any, least: float) -> Any:
     for k in range(len(extrema)):
         level, row, column = extrema[k]
         for _ in range(MOST_STEPS):
-            here = differences[level - 1 : level + 2, row - 1 : row + 2, column - 1 : column + 2]
-            value = float(here[1, 1, 1])
-            gx = (here[1, 1, 2] - here[1, 1, 0]) / 2.0
-            gy = (here[1, 2, 1] - here[1, 0, 1]) / 2.0
-            gs = (here[2, 1, 1] - here[0, 1, 1]) / 2.0
-            xx = here[1, 1, 2] + here[1, 1, 0] - 2.0 * value
-            yy = here[1, 2, 1] + here[1, 0, 1] - 2.0 * value
-            ss = here[2, 1, 1] + here[0, 1, 1] - 2.0 * value
-            xy = (here[1, 2, 2] - here[1, 2, 0] - here[1, 0, 2] + here[1, 0, 0]) / 4.0
-            xs = (here[2, 1, 2] - here[2, 1, 0] - here[0, 1, 2] + here[0, 1, 0]) / 4.0
-            ys = (here[2, 2, 1] - here[2, 0, 1] - here[0, 2, 1] + here[0, 0, 1]) / 4.0
-            # Newton's step, by the cofactors of the symmetric matrix of second derivatives
-            c_xx, c_xy, c_xs = yy * ss - ys * ys, xs * ys - xy * ss, xy * ys - xs * yy
-            c_yy, c_ys, c_ss = xx * ss - xs * xs, xy * xs - xx * ys, xx * yy - xy * xy
-            determinant = xx * c_xx + xy * c_xy + xs * c_xs
-            dx = -(c_xx * gx + c_xy * gy + c_xs * gs) / determinant
-            dy = -(c_xy * gx + c_yy * gy + c_ys * gs) / determinant
-            ds = -(c_xs * gx + c_ys * gy + c_ss * gs) / determinant
-            largest = max(abs(dx), abs(dy), abs(ds))
-            if largest < 0.5:
-                value += 0.5 * (gx * dx + gy * dy + gs * ds)
-                # of the curvatures along and across: their ratio r has (r + 1)^2 / r = trace^2 / determinant
-                is_corner = c_ss > 0.0 and (xx + yy) ** 2 * EDGE_RATIO < (EDGE_RATIO + 1.0) ** 2 * c_ss
-                if abs(value) >= least and is_corner:
-                    places[count, 0], places[count, 1], places[count, 2] = level, row, column
-                    offsets[count, 0], offsets[count, 1], offsets[count, 2] = ds, dy, dx
-                    values[count] = abs(value)
-                    count += 1
-                break
-            if not largest < width + height:  # also of a flat place, where it is infinite or not a number
-                break
-            level, row, column = level + round(ds), row + round(dy), column + round(dx)
             if not (
                 1 <= level < levels - 1
                 and BORDER_PX <= row < height - BORDER_PX
                 and BORDER_PX <= column < width - BORDER_PX
             ):
                 break
+            (ds, dy, dx), value, is_corner = _newton_step(
+                differences[level - 1 : level + 2, row - 1 : row + 2, column - 1 : column + 2]
+            )
+            largest = max(abs(dx), abs(dy), abs(ds))
+            if largest < 0.5 and is_corner and abs(value) >= least:
+                places[count, 0], places[count, 1], places[count, 2] = level, row, column
+                offsets[count, 0], offsets[count, 1], offsets[count, 2] = ds, dy, dx
+                values[count] = abs(value)
+                count += 1
+            if not 0.5 <= largest < width + height:
+                break
+            level, row, column = level + round(ds), row + round(dy), column + round(dx)
     return places[:count], offsets[:count], values[:count]
 
 
@@ -239,33 +255,18 @@ def find_keypoints(gray: Bytes, *, least_contrast: float) -> tuple[Keypoints, li
     gradients: list[Gradients] = []
     least = least_contrast * GREY_VALUES / LEVELS
     for octave in scale_space(gray):
-        places, offsets, values = _between_pixels(
-            octave.differences, _extrema(octave.differences, np.float32(0.5 * least)), least
-        )
+        extrema = _extrema(octave.differences, np.float32(0.5 * least))
+        places, offsets, values = _between_pixels(octave.differences, extrema, least)
         # Extrema beside each other may lead to the same one.
         _, once = np.unique(np.ravel_multi_index(tuple(places.T), octave.differences.shape), return_index=True)
-        for level in range(1, LEVELS + 1):
+        for level, here in enumerate(octave.gradients, start=1):
             rows = once[places[once, 0] == level]
             scale, y, x = (places[rows] + offsets[rows]).T
-            sigma = SIGMA_PX * 2.0 ** (scale / LEVELS)
-            here = octave.gradients[level - 1]
-            in_steps = np.column_stack([x, y, sigma]) * (octave.step_px / here.step_px)
-            having, directions = _directions(here.magnitude, here.direction_rad, in_steps)
-            in_image = in_steps[having] * here.step_px
-            found.append(
-                Keypoints(
-                    xy_px=in_image[:, :2],
-                    sigma_px=in_image[:, 2],
-                    contrast=values[rows][having] / GREY_VALUES,
-                    level=np.full(len(having), len(gradients), np.int64),
-                    direction_rad=directions,
-                )
-            )
+            xy, sigma = np.column_stack([x, y]) * octave.step_px, SIGMA_PX * octave.step_px * 2.0 ** (scale / LEVELS)
+            in_steps = np.column_stack([xy, sigma]) / here.step_px
+            having, direction_rad = _directions(here.magnitude, here.direction_rad, in_steps)
+            of_level = np.full(len(having), len(gradients), np.int64)
+            contrast = values[rows[having]] / GREY_VALUES
+            found.append(Keypoints(xy[having], sigma[having], contrast, of_level, direction_rad))
             gradients.append(here)
-    return _joined(found), gradients
-
-
-def _joined(parts: list[Keypoints]) -> Keypoints:
-    names = ("xy_px", "sigma_px", "contrast", "level", "direction_rad")
-    nothing = Keypoints(np.zeros((0, 2)), np.zeros(0), np.zeros(0), np.zeros(0, np.int64), np.zeros(0))
-    return Keypoints(*(np.concatenate([getattr(part, name) for part in [nothing, *parts]]) for name in names))
+    return Keypoints.joined(found), gradients

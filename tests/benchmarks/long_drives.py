@@ -26,6 +26,8 @@ import cv2
 import numpy as np
 import psutil
 
+from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.trajectory_file import read_tum
 from schemas.api.jobs import JobKind, JobState
@@ -122,10 +124,10 @@ def _seconds_of(pool: Executor, images: list[int]) -> float:
 def _extract(images: int) -> None:
     """Extract the keypoints of a picture of noise so often, in one thread."""
     cv2.setNumThreads(1)
-    noise = np.random.default_rng(SEED).integers(0, 256, (720, 1280), dtype=np.uint8)
-    picture, extractor = cv2.GaussianBlur(noise, (0, 0), 2.0), cv2.SIFT.create(2048)
+    noise = np.random.default_rng(SEED).integers(0, 256, (720, 1280, 3), dtype=np.uint8)
+    picture, extractor = np.asarray(cv2.GaussianBlur(noise, (0, 0), 2.0), np.uint8), SiftExtractor(FeatureConfig())
     for _ in range(images):
-        extractor.detectAndCompute(picture, None)
+        extractor.extract(picture, None)
 
 
 def _of_scene(line: str, title: str, scene: Path, drive: Path, units: int) -> Iterator[Figure]:
