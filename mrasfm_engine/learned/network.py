@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from contextlib import redirect_stdout
+from contextlib import nullcontext, redirect_stdout
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,8 @@ class Network:
         The model's bytes, see `onnx_file.read_model`.
     gpu
         Use a GPU where this onnxruntime has a provider that starts; else the CPU.
+    keeps_memory
+        Keep a call's memory for the next one; without, a network of one operator is a megabyte smaller.
 
     Raises
     ------
@@ -46,7 +48,7 @@ class Network:
         Where this runtime cannot load the model, as when it lacks an operator.
     """
 
-    def __init__(self, name: str, data: bytes, *, gpu: bool) -> None:
+    def __init__(self, name: str, data: bytes, *, gpu: bool, keeps_memory: bool = True) -> None:
         # Loads in half a second; who uses no model does not wait for it.
         import onnxruntime
 
@@ -55,12 +57,14 @@ class Network:
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         # The number of keypoints differs from call to call: plans of memory for one shape would not be used again.
         options.enable_mem_pattern = False
+        options.enable_cpu_mem_arena = keeps_memory
         options.log_severity_level = _QUIET
         there = onnxruntime.get_available_providers()
         providers = [p for p in GPU_PROVIDERS if gpu and p in there] + [CPU_PROVIDER]
         try:
-            # A command's own output is JSON: onnxruntime prints there where a GPU does not start.
-            with redirect_stdout(sys.stderr):
+            # A command's own output is JSON: onnxruntime prints there where a GPU does not start. On a CPU it prints
+            # nothing, and networks are made in many threads at once.
+            with nullcontext() if providers == [CPU_PROVIDER] else redirect_stdout(sys.stderr):
                 if CUDA_PROVIDER in providers:
                     onnxruntime.preload_dlls()  # as pip installs CUDA beside onnxruntime-gpu, it lies on no search path
                 self._session = onnxruntime.InferenceSession(data, options, providers=providers)

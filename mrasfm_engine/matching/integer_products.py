@@ -3,6 +3,9 @@
 Processors multiply and add four bytes where they would one float, but BLAS has no such product. onnxruntime has one for
 every kind of processor, as the operator MatMulInteger; this module writes the graph with that one operator.
 
+The right side is a constant of its graph: packed as the instructions take it, which is done once, and not for each of
+the many short products that one pair of images is made of.
+
 Most processors have the instruction for bytes without a sign times bytes with one. Where it is missing, onnxruntime
 adds such products in 16 bits, which overflow: it is tried once, and there both sides have no sign, at half the speed.
 """
@@ -12,7 +15,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.types import Bytes, Floats32, Ints32
@@ -23,15 +25,23 @@ SIGN = 128  # what bytes with a sign are smaller by
 TRIED = (64, 128, 64)  # shape of the products that are tried: several of every kernel's blocks
 
 
-def right_side(rows: Bytes) -> NDArray[np.int8] | Bytes:
-    """The right side (k, m) of a product, of its columns as rows (m, k)."""
-    columns = np.ascontiguousarray(rows.T)
-    return (columns ^ SIGN).view(np.int8) if _signs_are_exact() else columns
+class RightSide:
+    """The right side of products of bytes, packed; any thread may multiply by it.
 
+    Parameters
+    ----------
+    rows
+        (m, k) its columns.
+    """
 
-def product_of_bytes(a: Bytes, b: NDArray[np.int8] | Bytes) -> Ints32:
-    """Matrix product (n, m) of bytes (n, k) and what `right_side` made (k, m), less `missing` of each row."""
-    return np.asarray(_operator(b.dtype == np.int8).run({"a": a, "b": b})["y"], dtype=np.int32)
+    def __init__(self, rows: Bytes) -> None:
+        columns = np.ascontiguousarray(rows.T)
+        self.is_signed = _signs_are_exact()
+        self._operator = _operator(columns ^ SIGN, INT8) if self.is_signed else _operator(columns, UINT8)
+
+    def product(self, a: Bytes) -> Ints32:
+        """Matrix product (n, m) of bytes (n, k) and this side (k, m), less `missing` of each row."""
+        return np.asarray(self._operator.run({"a": a})["y"], dtype=np.int32)
 
 
 def missing(a: Bytes) -> Floats32:
@@ -46,20 +56,22 @@ def _signs_are_exact() -> bool:
     n, k, m = TRIED
     a, b = np.full((n, k), 255, np.uint8), np.full((k, m), 127, np.int8)
     b[:, ::2] = -128
-    return np.array_equal(product_of_bytes(a, b), a.astype(np.int32) @ b.astype(np.int32))
+    found = _operator(b.view(np.uint8), INT8).run({"a": a})["y"]
+    return np.array_equal(found, a.astype(np.int32) @ b.astype(np.int32))
 
 
-@cache
-def _operator(signed: bool) -> Network:
-    return Network("product of bytes", _model(INT8 if signed else UINT8), gpu=False)
+def _operator(right: Bytes, element: int) -> Network:
+    """The product with a right side (k, m), whose bytes are numbers of an element type."""
+    return Network("product of bytes", _model(right, element), gpu=False, keeps_memory=False)
 
 
-def _model(right: int) -> bytes:
+def _model(right: Bytes, element: int) -> bytes:
     """The file: an ONNX ModelProto, of which the numbers are those of the fields in onnx.proto."""
     node = _field(1, b"a") + _field(1, b"b") + _field(2, b"y") + _field(4, b"MatMulInteger")
-    graph = _field(1, node) + _field(2, b"product")
-    graph += _field(11, _value(b"a", UINT8, b"n", b"k")) + _field(11, _value(b"b", right, b"k", b"m"))
-    graph += _field(12, _value(b"y", INT32, b"n", b"m"))
+    sides = b"".join(_number(1, side) for side in right.shape)
+    constant = sides + _number(2, element) + _field(8, b"b") + _field(9, right.tobytes())
+    graph = _field(1, node) + _field(2, b"product") + _field(5, constant)
+    graph += _field(11, _value(b"a", UINT8, b"n", b"k")) + _field(12, _value(b"y", INT32, b"n", b"m"))
     operators = _field(1, b"") + _number(2, OPERATORS_VERSION)
     return _number(1, IR_VERSION) + _field(7, graph) + _field(8, operators)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.learned.catalogue import Method
-from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
+from mrasfm_engine.matching.integer_products import RightSide, missing
 from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Floats32, Ints32
 
@@ -158,7 +158,7 @@ class Prepared:
     """Descriptors of an image as the matcher needs them."""
 
     rows: NDArray[Any]  # (n, D) bytes or floats
-    columns: NDArray[Any]  # (D, n), of bytes as `integer_products.right_side` makes them
+    columns: NDArray[Any] | RightSide  # (D, n)
     missing: Floats32  # (n,) what products of bytes with a row are short of
     inverse_lengths: Floats32  # (n,)
 
@@ -178,7 +178,7 @@ class NearestNeighbourMatcher:
         lengths = np.linalg.norm(rows.astype(np.float32), axis=1)
         inverse = (1.0 / np.maximum(lengths, 1e-6)).astype(np.float32)
         if rows.dtype == np.uint8:
-            return Prepared(rows, right_side(rows), missing(rows), inverse)
+            return Prepared(rows, RightSide(rows), missing(rows), inverse)
         # Floats that BLAS transposes on the way need no second copy.
         return Prepared(rows, rows.T, np.zeros(len(rows), np.float32), inverse)
 
@@ -191,11 +191,8 @@ class NearestNeighbourMatcher:
         step = _rows_at_a_time(a.rows.dtype, len(b))
         for start in range(0, len(a), step):
             rows = slice(start, start + step)
-            products = (
-                product_of_bytes(a.rows[rows], b.columns) if a.rows.dtype == np.uint8 else a.rows[rows] @ b.columns
-            )
             _take_rows(
-                products,
+                b.columns.product(a.rows[rows]) if isinstance(b.columns, RightSide) else a.rows[rows] @ b.columns,
                 a.missing[rows],
                 a.inverse_lengths[rows],
                 b.inverse_lengths,

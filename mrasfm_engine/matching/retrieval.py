@@ -180,11 +180,10 @@ def _vocabulary(features: Sequence[ImageFeatures]) -> Floats32:
 
 def _vlad(found: ImageFeatures, centres: Floats32) -> Floats32:
     """Unit-length VLAD vector (WORDS * D,) with intra-normalisation (Arandjelovic and Zisserman, 2013)."""
-    result = np.zeros(centres.shape, np.float32)
     strongest = _unit_length(found.descriptors[:KEYPOINTS_PER_IMAGE])
-    if len(strongest):
-        word = (strongest @ centres.T - 0.5 * (centres**2).sum(1)).argmax(1)
-        np.add.at(result, word, strongest - centres[word])
+    nearest = (strongest @ centres.T - 0.5 * (centres**2).sum(1)).argmax(1)
+    is_of = (np.arange(len(centres))[:, None] == nearest).astype(np.float32)
+    result: Floats32 = is_of @ strongest - is_of.sum(1, keepdims=True) * centres
     result /= np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-6)
     flat = result.ravel()
     normalised: Floats32 = flat / np.maximum(np.linalg.norm(flat), 1e-6)

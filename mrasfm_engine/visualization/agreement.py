@@ -135,9 +135,7 @@ def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int
     whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_trajectory_m < ROADSIDE_M)
     r, c = r[whole], c[whole]
     gray = _gray(mosaic)
-    contrast = np.array(
-        [min(float(g[i : i + size, j : j + size].std()) for g in gray[REFINED]) for i, j in zip(r, c, strict=True)]
-    )
+    contrast = np.minimum(*(_contrast(g, size)[r, c] for g in gray[REFINED]))
     best = [k for k in np.argsort(-contrast, kind="stable")[:MAX_BLOCKS] if contrast[k] >= MIN_CONTRAST]
     return [
         _Block(
@@ -149,6 +147,16 @@ def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int
         )
         for k in best
     ]
+
+
+def _contrast(gray: Floats32, size: int) -> Floats:
+    """Standard deviation (h, w) of the piece of so many pixels a side that begins at each pixel."""
+    means, squares = (
+        each(gray, cv2.CV_64F, (size, size), anchor=(0, 0), borderType=cv2.BORDER_REFLECT)
+        for each in (cv2.boxFilter, cv2.sqrBoxFilter)
+    )
+    result: Floats = np.sqrt(np.maximum(squares - means**2, 0.0))
+    return result
 
 
 def _compare(blocks: Sequence[_Block], which: int, margin: int, cell_m: float) -> Agreement:

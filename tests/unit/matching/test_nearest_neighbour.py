@@ -5,7 +5,7 @@ import pytest
 
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.matching import integer_products, nearest_neighbour
-from mrasfm_engine.matching.integer_products import missing, product_of_bytes, right_side
+from mrasfm_engine.matching.integer_products import RightSide, missing
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher, Prepared
 from mrasfm_engine.scene.scene import ImageFeatures
 from tests.helpers.simulated_drive import random_descriptors
@@ -128,8 +128,9 @@ def test_products_of_bytes_are_exact(shape: tuple[int, int, int], signs: bool, m
     a, b = (rng.integers(low, 256, size, dtype=np.uint8) for low, size in ((128, (n, k)), (0, (m, k))))
     if not signs:  # as on a processor without the instruction
         monkeypatch.setattr(integer_products, "_signs_are_exact", lambda: False)
-        assert right_side(b).dtype == np.uint8
-    products = product_of_bytes(a, right_side(b)) + missing(a)[:, None]
+    right = RightSide(b)
+    assert right.is_signed == (signs and integer_products._signs_are_exact())
+    products = right.product(a) + missing(a)[:, None]
     assert np.array_equal(products, a.astype(np.int64) @ b.astype(np.int64).T)
 
 
