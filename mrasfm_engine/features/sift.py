@@ -14,7 +14,7 @@ from mrasfm_engine.features.sift_keypoints import Keypoints, find_keypoints
 from mrasfm_engine.features.sift_scale_space import Gradients
 from mrasfm_engine.learned.catalogue import Method
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.types import Bools, Bytes
+from mrasfm_engine.types import Bools, Bytes, Floats
 
 SMALLEST_DESCRIPTOR_SUM = 1e-3
 CANDIDATES = 2  # times the number wanted, of which those are chosen that cover the image
@@ -46,8 +46,7 @@ class SiftExtractor:
         if self._config.spread:
             keypoints = keypoints.chosen(covering_order(keypoints.xy_px.astype(np.float32)))
         keypoints = keypoints.chosen(slice(self._config.max_keypoints))
-        # The detector puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
-        xy = (keypoints.xy_px + 0.5) / np.divide(gray.shape[::-1], rgb.shape[1::-1])
+        xy = _xy_in_image(keypoints, gray, rgb.shape)
         descriptors = describe(keypoints, gradients)
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), SMALLEST_DESCRIPTOR_SUM))
         return ImageFeatures(
@@ -63,10 +62,16 @@ class SiftExtractor:
     def _found(self, gray: Bytes, mask: Bools | None) -> tuple[Keypoints, list[Gradients]]:
         keypoints, gradients = find_keypoints(gray, least_contrast=self._config.contrast_threshold)
         if mask is not None:
-            small_mask = cv2.resize(mask.astype(np.uint8), gray.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            column, row = np.round(keypoints.xy_px).astype(int).T
-            keypoints = keypoints.chosen(small_mask[row, column] > 0)
+            # not a reduced mask, whose pixels would say what others of the image show
+            column, row = _xy_in_image(keypoints, gray, mask.shape).astype(int).T
+            keypoints = keypoints.chosen(mask[row, column])
         return keypoints, gradients
+
+
+def _xy_in_image(keypoints: Keypoints, gray: Bytes, shape: tuple[int, ...]) -> Floats:
+    """Places (n, 2) of keypoints of a reduced image in the one of `shape` (h, w, ...) that it was made of."""
+    # The detector puts the centre of the top left pixel at (0, 0), the manifest and COLMAP at (0.5, 0.5).
+    return np.asarray((keypoints.xy_px + 0.5) / np.divide(gray.shape[::-1], shape[1::-1]), np.float64)
 
 
 METHOD = Method[FeatureConfig, SiftExtractor](build=SiftExtractor)

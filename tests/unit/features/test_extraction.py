@@ -67,6 +67,19 @@ def test_nothing_is_extracted_where_the_mask_says_so() -> None:
     assert features.xy_px[:, 0].min() > WIDTH // 2 - 1
 
 
+@pytest.mark.parametrize("max_side_px", [1600, 600, 333])
+def test_a_reduced_image_is_masked_by_every_pixel_of_the_mask(max_side_px: int) -> None:
+    image, _ = blobs(np.random.default_rng(4))
+    mask = np.random.default_rng(5).random((HEIGHT, WIDTH)) < 0.5
+    extractor = SiftExtractor(FeatureConfig(max_side_px=max_side_px, max_keypoints=100_000))
+    everywhere, masked = extractor.extract(image, None).xy_px, extractor.extract(image, mask).xy_px
+    column, row = everywhere.astype(int).T
+    expected = everywhere[mask[row, column]]
+    assert 50 < len(expected) < len(everywhere) - 50
+    assert sorted(masked.tolist()) == sorted(expected.tolist())
+    assert extractor.count(image, mask) == len(expected)
+
+
 def test_an_empty_image_has_no_keypoints() -> None:
     features = SiftExtractor(FeatureConfig()).extract(np.full((HEIGHT, WIDTH, 3), 90, np.uint8), None)
     assert features.xy_px.shape == (0, 2)
