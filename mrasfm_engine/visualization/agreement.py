@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry.parabola import vertex
-from mrasfm_engine.types import Floats, Floats32
+from mrasfm_engine.types import Floats, Floats32, Ints
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic
 from mrasfm_engine.visualization.views import GIVEN, REFINED
 
@@ -135,7 +135,7 @@ def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int
     whole = (cover >= MIN_COVER * (size + 2 * margin) ** 2) & (from_trajectory_m < ROADSIDE_M)
     r, c = r[whole], c[whole]
     gray = _gray(mosaic)
-    contrast = np.minimum(*(_contrast(g, size)[r, c] for g in gray[REFINED]))
+    contrast = np.minimum(*(_contrast(g, r, c, size) for g in gray[REFINED]))
     best = [k for k in np.argsort(-contrast, kind="stable")[:MAX_BLOCKS] if contrast[k] >= MIN_CONTRAST]
     return [
         _Block(
@@ -149,13 +149,10 @@ def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int
     ]
 
 
-def _contrast(gray: Floats32, size: int) -> Floats:
-    """Standard deviation (h, w) of the piece of so many pixels a side that begins at each pixel."""
-    means, squares = (
-        each(gray, cv2.CV_64F, (size, size), anchor=(0, 0), borderType=cv2.BORDER_REFLECT)
-        for each in (cv2.boxFilter, cv2.sqrBoxFilter)
-    )
-    result: Floats = np.sqrt(np.maximum(squares - means**2, 0.0))
+def _contrast(gray: Floats32, r: Ints, c: Ints, size: int) -> Floats32:
+    """Standard deviation (n,) of the pieces of so many pixels a side that begin at rows and columns (n,)."""
+    pieces = np.lib.stride_tricks.sliding_window_view(gray, (size, size))[r, c]
+    result: Floats32 = pieces.std(axis=(1, 2))
     return result
 
 
