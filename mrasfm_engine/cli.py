@@ -18,6 +18,7 @@ from importlib.metadata import EntryPoint, entry_points, version
 from pathlib import Path
 
 from mrasfm_engine.errors import CancelledError, MrasfmError, TerminatedError
+from mrasfm_engine.freed_memory import loading
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -94,7 +95,9 @@ def main(argv: list[str] | None = None) -> int:
     commands = _commands()
     # Only what is asked for is loaded; what is none, or comes after an option, gets the words of the whole parser.
     entries = [commands[words[0]]] if words[0] in commands else list(commands.values())
-    arguments = _parser_of([] if words[0] == "--version" else entries).parse_args(words)
+    with loading():
+        parser = _parser_of([] if words[0] == "--version" else entries)
+    arguments = parser.parse_args(words)
     try:
         code = int(arguments.run(arguments) or 0)
         sys.stdout.flush()

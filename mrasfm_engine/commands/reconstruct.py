@@ -18,6 +18,7 @@ from rich.console import Console
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import CancelledError, TerminatedError
+from mrasfm_engine.freed_memory import loading
 from schemas.artifacts import REPORT_FILE, component_folder
 from schemas.command_line import output_folder
 
@@ -42,8 +43,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Reconstruct, show progress, and say what there is and how good."""
     config = read_config(arguments.config, **({"use_gnss": False} if arguments.no_gnss else {}))
     # The engine takes a second to load; help and argument errors should not wait for it.
-    from mrasfm_engine.compilation import watched_compilation
-    from mrasfm_engine.pipeline import reconstruct
+    with loading():
+        from mrasfm_engine.compilation import watched_compilation
+        from mrasfm_engine.pipeline import reconstruct
 
     console = Console(stderr=True)
     with (
