@@ -129,7 +129,7 @@ class SubmapConfig(_Section):
     """The cut of a long drive into sub-maps, which are extracted, matched and mapped by themselves and then joined."""
 
     count: Count | None = Field(
-        None, description="by default as few as `memory_mb` allows, or as many as there are workers for"
+        None, description="by default as few as `memory_mb` allows, in rounds of as many as there are workers for"
     )
     memory_mb: Positive = Field(
         1500.0, description="expected memory of mapping a sub-map besides the program's own; larger drives are cut"

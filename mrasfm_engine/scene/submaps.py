@@ -91,6 +91,14 @@ def count_for_workers(drive: Drive, workers: int, overlap: int) -> int:
     return max(1, min(workers, by_length, len(drive.images) // LEAST_IMAGES))
 
 
+def count_in_rounds(for_memory: int, for_workers: int) -> int:
+    """Number of sub-maps that are no fewer than memory asks for, and as many for each worker.
+
+    With one more than there are workers, all but one would wait for as long again.
+    """
+    return math.ceil(for_memory / for_workers) * for_workers
+
+
 def cut(units: int, count: int, overlap: int) -> list[Span]:
     """Cut a drive into sub-maps of nearly equal length, of which neighbours share some units.
 

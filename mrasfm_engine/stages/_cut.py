@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.io.stage_store import fingerprint
-from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, cut, spans_between
+from mrasfm_engine.scene.submaps import Span, count_for_memory, count_for_workers, count_in_rounds, cut, spans_between
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.stages._standing import keep_nothing_left_out
 
@@ -58,4 +58,5 @@ def count_of_submaps(run: Run, workers: int) -> int:
         keypoints_per_image=run.config.features.max_keypoints,
         memory_bytes=settings.memory_mb * BYTES_PER_MB,
     )
-    return settings.count or max(for_memory, count_for_workers(run.drive, workers, settings.overlap_units))
+    for_workers = count_for_workers(run.drive, workers, settings.overlap_units)
+    return settings.count or count_in_rounds(for_memory, for_workers)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mrasfm_engine.scene.submaps import count_for_memory, count_for_workers, cut, share_a_submap
+from mrasfm_engine.scene.submaps import count_for_memory, count_for_workers, count_in_rounds, cut, share_a_submap
 from tests.helpers.simulated_drive import make_simulated_drive
 
 
@@ -49,6 +49,13 @@ def test_a_drive_too_short_for_two_is_one_piece(units: int) -> None:
 def test_workers_get_sub_maps_that_are_worth_it(units: int, workers: int, count: int) -> None:
     drive = make_simulated_drive(units=units, cameras=6, points=50).drive
     assert count_for_workers(drive, workers, overlap=10) == count
+
+
+@pytest.mark.parametrize(
+    ("for_memory", "for_workers", "count"), [(5, 1, 5), (1, 4, 4), (4, 4, 4), (5, 4, 8), (9, 4, 12), (3, 14, 14)]
+)
+def test_no_worker_waits_for_a_last_round_of_few_sub_maps(for_memory: int, for_workers: int, count: int) -> None:
+    assert count_in_rounds(for_memory, for_workers) == count
 
 
 def test_memory_decides_in_how_many_parts_a_drive_is_cut() -> None:
