@@ -37,7 +37,7 @@ class RightSide:
     def __init__(self, rows: Bytes) -> None:
         columns = np.ascontiguousarray(rows.T)
         self.is_signed = _signs_are_exact()
-        self._operator = _operator(columns ^ SIGN, INT8) if self.is_signed else _operator(columns, UINT8)
+        self._operator = _operator(columns ^ np.uint8(SIGN), INT8) if self.is_signed else _operator(columns, UINT8)
 
     def product(self, a: Bytes) -> Ints32:
         """Matrix product (n, m) of bytes (n, k) and this side (k, m), less `missing` of each row."""
