@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import gc
 import sys
 
 import pytest
 
-from mrasfm_engine.freed_memory import return_freed_memory
+from mrasfm_engine.freed_memory import loading, return_freed_memory
 from mrasfm_engine.subprocess_run import memory_bytes, run_in_subprocess
 from mrasfm_engine.types import StageProgress
 
@@ -28,3 +29,16 @@ def test_freed_memory_goes_back_to_the_system() -> None:
     assert ended.result is not None
     held, left = ended.result
     assert held - left > 0.8 * BLOCK * BLOCKS
+
+
+def test_garbage_is_looked_for_again_once_modules_are_loaded_or_fail_to() -> None:
+    before = gc.get_freeze_count()
+    looked_for = [gc.isenabled()]
+    with pytest.raises(ImportError), loading():
+        looked_for.append(gc.isenabled())
+        raise ImportError
+    looked_for.append(gc.isenabled())
+    kept = gc.get_freeze_count()
+    gc.unfreeze()
+    assert looked_for == [True, False, True]
+    assert kept > before
