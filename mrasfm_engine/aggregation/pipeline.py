@@ -25,7 +25,7 @@ from mrasfm_engine.aggregation.vehicles import Vehicle, vehicles_of
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import CancelledError, InputError
 from mrasfm_engine.export.map import write_map
-from mrasfm_engine.export.publishing import COMPLETE_MARK, require_free
+from mrasfm_engine.export.publishing import COMPLETE_MARK, only_run, require_free
 from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.types import Floats, StageProgress
@@ -79,7 +79,7 @@ def aggregate(
     Raises
     ------
     InputError, StorageError, CancelledError
-        See `errors`. A map that was there is untouched then.
+        See `errors`; also where another run makes a map in `out`. A map that was there is untouched then.
     """
     if into is None and remove:
         raise InputError("--remove needs the map to remove from", remedy="Give --into MAP.", code="no-such-scene")
@@ -91,13 +91,28 @@ def aggregate(
         )
     require_free(out, result="map")
     named = name_scenes(scenes)
-    run = stages.Run(config, StageStore(out / CHECKPOINT_FOLDER), into, progress, cancel)
-    run.report["settings"] = config.model_dump(mode="json")
-    found = stages.scenes(run, named, remove, leave_out=leave_out)
+    with only_run(out):
+        run = stages.Run(config, StageStore(out / CHECKPOINT_FOLDER), into, progress, cancel)
+        run.report["settings"] = config.model_dump(mode="json")
+        found = stages.scenes(run, named, remove, leave_out=leave_out)
+        result = _joined(run, found, leave_out=leave_out, require_components=require_components)
+        say_findings(run, result)
+        pictures = map_pictures(run, result) if config.output.pictures else {}
+        if cancel():
+            raise CancelledError
+        run.begin(Stage.EXPORT)
+        complete_report(run.report)
+        report = write_map(map_content(run, result, pictures), out, run.report)
+    run.progress(Stage.EXPORT, 1, 1)
+    return report
+
+
+def _joined(run: stages.Run, found: Sequence[SourceScene], *, leave_out: bool, require_components: bool) -> MapResult:
+    """The scenes that can be in the map, compared and joined."""
     known = stages.association(run, found)
     found = stages.at_length(run, found, known)
     seams = stages.seams(run, found, known)
-    graph, loops, chains = _graph(found, known, seams, config)
+    graph, loops, chains = _graph(found, known, seams, run.config)
     kept = stages.without_unplaced(
         run,
         found,
@@ -110,17 +125,8 @@ def aggregate(
         found, known = [found[k] for k in kept], known.of_scenes(kept)
         names = {scene.name for scene in found}
         seams = [seam for seam in seams if {seam.a, seam.b} <= names]
-        graph, loops, chains = _graph(found, known, seams, config)
-    result = _join_scenes(run, found, known, seams, graph, loops, chains)
-    say_findings(run, result)
-    pictures = map_pictures(run, result) if config.output.pictures else {}
-    if cancel():
-        raise CancelledError
-    run.begin(Stage.EXPORT)
-    complete_report(run.report)
-    report = write_map(map_content(run, result, pictures), out, run.report)
-    run.progress(Stage.EXPORT, 1, 1)
-    return report
+        graph, loops, chains = _graph(found, known, seams, run.config)
+    return _join_scenes(run, found, known, seams, graph, loops, chains)
 
 
 def _graph(

@@ -13,6 +13,7 @@ from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, print_report
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.freed_memory import loading
 from schemas.command_line import output_folder
 
 
@@ -44,8 +45,9 @@ def run(arguments: argparse.Namespace) -> int:
     config = read_config(arguments.config)
     scenes = _named(arguments.scenes)
     # The engine takes a second to load; help and argument errors should not wait for it.
-    from mrasfm_engine.aggregation import aggregate
-    from mrasfm_engine.aggregation.stages import map_document
+    with loading():
+        from mrasfm_engine.aggregation import aggregate
+        from mrasfm_engine.aggregation.stages import map_document
 
     console = Console(stderr=True)
     with cancel_on_interrupt(console) as cancelled, stage_progress(console) as progress:

@@ -13,6 +13,7 @@ from mrasfm_engine.aggregation.pipeline import aggregate
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.map import REPLACED
+from mrasfm_engine.export.publishing import only_run
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.io.stage_store import StageStore
 from mrasfm_engine.pipeline import reconstruct
@@ -49,6 +50,14 @@ def test_a_folder_with_files_that_no_map_has_made_is_refused(tmp_path: Path) -> 
         aggregate(scenes, tmp_path, CONFIG)
     assert found.value.code == "bad-out-folder"
     assert contents(tmp_path) == before
+
+
+def test_one_run_at_a_time_makes_a_map_in_a_folder(tmp_path: Path) -> None:
+    """Two would look for the same seams, and the later one would replace the map of the other."""
+    with only_run(tmp_path / "map"), pytest.raises(InputError, match=r"another run is making .*map") as found:
+        aggregate([tmp_path / "one", tmp_path / "two"], tmp_path / "map", CONFIG)
+    assert found.value.code == "output-in-use"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_map_is_replaced_by_the_next_and_no_name_of_it_is_unknown(tmp_path: Path) -> None:
