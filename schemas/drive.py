@@ -84,7 +84,8 @@ VEHICLE_NAME = Pattern(
 Vehicle = Annotated[str, VEHICLE_NAME]
 # Names that people read have no control characters: terminals would obey them.
 PRINTED_NAME = Pattern(r"^[^\x00-\x1f\x7f-\x9f]+$", words="characters that can be printed, without control characters")
-DriveName = Annotated[str, Field(min_length=1, max_length=200), PRINTED_NAME]
+MAX_DRIVE_NAME_CHARACTERS = 200
+DriveName = Annotated[str, Field(min_length=1, max_length=MAX_DRIVE_NAME_CHARACTERS), PRINTED_NAME]
 
 
 def _relative_path(value: str) -> str:

@@ -46,6 +46,7 @@ def register(subparsers: Any) -> None:
     parser.add_argument("--gnss", type=Path, metavar="FILE", help="GNSS table, in RECORDING or the working directory")
     parser.add_argument("--cameras", type=_words, metavar="NAME,...", help="cameras that are wanted (default: all)")
     parser.add_argument("--scene", metavar="NAME", help="name of the scene, if the recording holds several")
+    parser.add_argument("--name", help="what the drive is called, and its scene (default: as the recording)")
     parser.add_argument(
         "--vehicle", metavar="NAME", help="which vehicle drove, where the recording does not say or is wrong"
     )
@@ -151,6 +152,7 @@ def run(arguments: argparse.Namespace) -> int:
         gnss_file=arguments.gnss,
         scene=arguments.scene,
         options={name: getattr(arguments, name) for name in OPTIONS},
+        name=arguments.name,
         vehicle=arguments.vehicle,
         truth=arguments.truth,
         copy=arguments.copy,

@@ -193,6 +193,7 @@ _shtab_mrasfm_import_options=(
   "--gnss[GNSS table, in RECORDING or the working directory]:FILE:"
   "--cameras[cameras that are wanted (default\: all)]:NAME,...:"
   "--scene[name of the scene, if the recording holds several]:NAME:"
+  "--name[what the drive is called, and its scene (default\: as the recording)]:name:"
   "--vehicle[which vehicle drove, where the recording does not say or is wrong]:NAME:"
   "--truth[write truth.tum also where the true poses and the GNSS come from one system (KITTI raw)]"
   "--rough-noise[the recording\'s poses (nuScenes, Argoverse 2, ...) with this noise become rough poses\: a trial of drives without GNSS]:METRES,DEGREES:"

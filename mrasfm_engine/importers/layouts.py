@@ -30,7 +30,7 @@ from mrasfm_engine.importers.skipped_images import notes_of_missing_images, note
 from mrasfm_engine.importers.tables import ANTENNA_FILE, read_antenna, read_gnss_csv
 from mrasfm_engine.io.axes import flu_from_body
 from schemas import Gnss, GnssSample
-from schemas.drive import MAX_RIG_EXTENT_M, VEHICLE_NAME
+from schemas.drive import MAX_DRIVE_NAME_CHARACTERS, MAX_RIG_EXTENT_M, PRINTED_NAME, VEHICLE_NAME
 from schemas.findings import listed
 
 LAYOUTS: tuple[ModuleType, ...] = (
@@ -59,6 +59,7 @@ def import_recording(
     gnss_file: Path | None = None,
     scene: str | None = None,
     options: Mapping[str, Any] | None = None,
+    name: str | None = None,
     vehicle: str | None = None,
     truth: bool = False,
     rough_noise: RoughQuality | None = None,
@@ -84,6 +85,8 @@ def import_recording(
         Name of the scene, for layouts that hold several.
     options
         Further ones of the layout, by the names in its `OPTIONS`.
+    name
+        Name of the drive instead of the recording's: of two pieces of one recording, say.
     vehicle
         Which vehicle drove, instead of what the recording says.
     truth
@@ -101,7 +104,7 @@ def import_recording(
         If the drive cannot be written.
     """
     folder, out = Path(folder), Path(out)
-    _require_vehicle_name(vehicle)
+    _require_names(name, vehicle)
     if not folder.exists():
         raise InputError(f"recording {folder} does not exist", remedy="Check the path.", code="missing-folder")
     if folder.resolve() == out.resolve() or out.resolve() in folder.resolve().parents:
@@ -111,8 +114,7 @@ def import_recording(
     wanted = {**(options or {}), "scene": scene}
     with folder_beside(out) as scratch:
         recording = select_units(select_cameras(_read(folder, wanted, scratch), cameras), frames)
-        if vehicle is not None:
-            recording = replace(recording, vehicle=vehicle)
+        recording = replace(recording, name=name or recording.name, vehicle=vehicle or recording.vehicle)
         if rough_noise is not None:
             recording = with_rough_poses(recording, rough_noise)
         if recording.truth_is_gnss and not truth:
@@ -121,7 +123,15 @@ def import_recording(
         return write_recording(recording, out, copy=copy, force=force)
 
 
-def _require_vehicle_name(vehicle: str | None) -> None:
+def _require_names(name: str | None, vehicle: str | None) -> None:
+    if name is not None and not (
+        len(name) <= MAX_DRIVE_NAME_CHARACTERS and re.fullmatch(PRINTED_NAME.expression, name)
+    ):
+        raise InputError(
+            f"--name {name!r} is no name of a drive",
+            remedy=f"Give up to {MAX_DRIVE_NAME_CHARACTERS} {PRINTED_NAME.words}.",
+            code="bad-drive-name",
+        )
     if vehicle is not None and not re.fullmatch(VEHICLE_NAME.expression, vehicle):
         raise InputError(
             f"--vehicle {vehicle!r} is no name of a vehicle",

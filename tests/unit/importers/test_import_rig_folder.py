@@ -89,6 +89,14 @@ def test_the_vehicle_of_the_rig(recording: Path, tmp_path: Path) -> None:
     assert "--vehicle" in refused(recording, tmp_path / "other", vehicle="M-AB\n").what
 
 
+def test_a_piece_of_a_recording_has_a_name_of_its_own(recording: Path, tmp_path: Path) -> None:
+    import_recording(recording, tmp_path / "drive", frames=":2", name="Straße, 1st half")
+    assert read_drive(tmp_path / "drive").manifest.name == "Straße, 1st half"
+    for name in ("", "a\nb", "x" * 201):
+        error = refused(recording, tmp_path / "other", name=name)
+        assert (error.what, error.code) == (f"--name {name!r} is no name of a drive", "bad-drive-name")
+
+
 def test_cameras_whose_folders_are_one_on_many_systems(recording: Path, tmp_path: Path) -> None:
     def rename(document: dict[str, Any]) -> None:
         document["cameras"]["CAM_L"] = document["cameras"].pop("cam_r")
