@@ -17,6 +17,9 @@ from mrasfm_engine.visualization.ground import GroundHeights, estimate_ground
 from mrasfm_engine.visualization.road_candidates import PLACE_M
 from mrasfm_engine.visualization.views import VIEW_M, View
 
+# Of the images of one camera within so much of the path one is painted: from the others the ground is no more than that
+# nearer, and of what stands in the way they show the same side.
+VIEW_STEP_M = PLACE_M / 4
 MIN_WAY_M = 3.0  # a shorter one has no direction of its own
 # Positions closer than this see the same blocks of ground, whenever the vehicle was there: both views and a block.
 SAME_PLACE_M = 2.5 * VIEW_M
@@ -33,7 +36,7 @@ class Plan:
     trajectory_m
         Positions (n, 2) of the registered units.
     images, views
-        The registered images, in the order in which they are painted.
+        Registered images `VIEW_STEP_M` apart, in the order in which they are painted.
     seen_by
         For every view the points that the cameras see at its time.
     """
@@ -140,18 +143,28 @@ def place_numbers(scene: Scene) -> Ints:
 
     Images of all cameras from there have consecutive numbers, from a multiple of the number of cameras.
     """
-    units = np.flatnonzero(scene.unit_registered)
-    steps = np.linalg.norm(np.diff(scene.world_from_rig[units][:, :3, 3], axis=0), axis=1)
-    piece = np.zeros(len(scene.unit_registered), dtype=np.int64)
-    piece[units] = np.concatenate([[0.0], np.cumsum(steps)]) // PLACE_M
     cameras = len(scene.drive.cameras)
-    unit, camera = np.array([(image.unit, image.camera) for image in scene.drive.images]).reshape(-1, 2).T
-    result: Ints = piece[unit] % (MAX_PLACES // cameras) * cameras + camera
+    unit, camera = _units_and_cameras(scene)
+    return _pieces(scene, PLACE_M)[unit] % (MAX_PLACES // cameras) * cameras + camera
+
+
+def _pieces(scene: Scene, length_m: float) -> Ints:
+    """Numbers (units,) of the pieces of the path that registered units are in."""
+    units = np.flatnonzero(scene.unit_registered)
+    steps_m = np.linalg.norm(np.diff(scene.world_from_rig[units][:, :3, 3], axis=0), axis=1)
+    piece = np.zeros(len(scene.unit_registered), dtype=np.int64)
+    piece[units] = np.concatenate([[0.0], np.cumsum(steps_m)]) // length_m
+    return piece
+
+
+def _units_and_cameras(scene: Scene) -> Ints:
+    """Unit and camera (2, images) of all images."""
+    result: Ints = np.array([(image.unit, image.camera) for image in scene.drive.images]).reshape(-1, 2).T
     return result
 
 
 def in_order_of_the_path(scene: Scene) -> Ints:
-    """Registered images in the order of the path, those of later visits with those of the first one.
+    """Registered images `VIEW_STEP_M` apart in the order of the path, those of later visits with those of the first.
 
     Against the driving direction where most cameras look ahead, so that they see ground from near first, and little is
     painted twice.
@@ -161,9 +174,9 @@ def in_order_of_the_path(scene: Scene) -> Ints:
     first_visit = np.zeros(len(scene.unit_registered), dtype=np.int64)
     first_visit[units] = first_visits(position)
     images = np.flatnonzero(scene.image_registered)
-    unit, camera = (
-        np.array([(scene.drive.images[i].unit, scene.drive.images[i].camera) for i in images]).reshape(-1, 2).T
-    )
+    unit, camera = _units_and_cameras(scene)[:, images]
+    _, apart = np.unique(_pieces(scene, VIEW_STEP_M)[unit] * len(scene.drive.cameras) + camera, return_index=True)
+    images, unit, camera = images[apart], unit[apart], camera[apart]
     forward = np.array([c.rig_from_cam[0, 2] > 0 for c in scene.calibration])[camera].mean() >= 0.5
     sign = -1 if forward else 1
     return images[np.lexsort((sign * unit, sign * first_visit[unit]))]

@@ -5,7 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.scene.scene import Scene
-from mrasfm_engine.visualization.plan import SAME_PLACE_M, first_visits, in_order_of_the_path, place_numbers
+from mrasfm_engine.visualization.plan import (
+    SAME_PLACE_M,
+    VIEW_STEP_M,
+    first_visits,
+    in_order_of_the_path,
+    place_numbers,
+)
 from mrasfm_engine.visualization.road_candidates import PLACE_M
 from tests.helpers.export_example import make_scene
 
@@ -34,6 +40,16 @@ def test_later_visits_come_with_the_first_one() -> None:
     assert sorted(order) == list(range(len(scene.drive.images)))
     far = there_and_back[[scene.drive.images[i].unit for i in order]] > 25.0
     assert np.abs(np.diff(far.astype(int))).sum() == 1  # all of one place, then all of the other
+
+
+def test_a_slow_vehicle_has_no_more_views_of_a_place_than_a_fast_one() -> None:
+    scene = scene_along(VIEW_STEP_M * np.array([0.0, 0.3, 0.9, 1.1, 2.5, 2.9]))
+    scene.image_registered[0] = False  # the first of its camera: the second one is taken
+    unit, camera = np.array([(image.unit, image.camera) for image in scene.drive.images]).T
+    order = in_order_of_the_path(scene)
+    assert camera[0] == 0
+    assert sorted(unit[order][camera[order] == 0]) == [1, 3, 4]
+    assert all(sorted(unit[order][camera[order] == c]) == [0, 3, 4] for c in range(1, len(scene.drive.cameras)))
 
 
 def test_passes_beside_one_another_are_visited_together() -> None:
