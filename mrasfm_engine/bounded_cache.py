@@ -8,8 +8,6 @@ from concurrent.futures import Future
 from threading import Lock
 from typing import Any, Generic, TypeVar
 
-import numpy as np
-
 Value = TypeVar("Value")
 
 
@@ -67,9 +65,9 @@ class BoundedCache(Generic[Value]):
 
 
 def bytes_of(value: Any) -> int:
-    """Bytes of the arrays in a value: an array, several of them, or an object that has some."""
-    if isinstance(value, np.ndarray):
-        return value.nbytes
+    """Bytes of the arrays in a value: an array, several of them, or an object that has some or says its `nbytes`."""
+    if isinstance(size := getattr(value, "nbytes", None), int):
+        return size
     if isinstance(value, list | tuple):
         return sum(map(bytes_of, value))
     return sum(map(bytes_of, vars(value).values())) if hasattr(value, "__dict__") else 0

@@ -32,10 +32,16 @@ class RightSide:
     ----------
     rows
         (m, k) its columns.
+
+    Attributes
+    ----------
+    nbytes
+        About what it takes in memory: packed, and once more in the file of its graph.
     """
 
     def __init__(self, rows: Bytes) -> None:
         columns = np.ascontiguousarray(rows.T)
+        self.nbytes = 2 * columns.nbytes
         self.is_signed = _signs_are_exact()
         self._operator = _operator(columns ^ np.uint8(SIGN), INT8) if self.is_signed else _operator(columns, UINT8)
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from mrasfm_engine.bounded_cache import bytes_of
 from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.matching import integer_products, nearest_neighbour
 from mrasfm_engine.matching.integer_products import RightSide, missing
@@ -118,6 +119,14 @@ def test_bytes_match_as_the_same_floats_do() -> None:
     ]
     assert found[0] == found[1]
     assert 150 < len(found[0]) <= 200
+
+
+def test_the_memory_of_prepared_bytes_is_known() -> None:
+    """Of their packed columns, which are in no array."""
+    d = random_descriptors(50, np.random.default_rng(3))
+    prepared = NearestNeighbourMatcher(MatchConfig()).prepare(features(d))
+    rows, columns, missing_and_lengths = d.nbytes, 2 * d.nbytes, 2 * 4 * len(d)
+    assert bytes_of(prepared) == rows + columns + missing_and_lengths
 
 
 @pytest.mark.parametrize("signs", [True, False])
