@@ -145,7 +145,8 @@ def place_numbers(scene: Scene) -> Ints:
     """
     cameras = len(scene.drive.cameras)
     unit, camera = _units_and_cameras(scene)
-    return _pieces(scene, PLACE_M)[unit] % (MAX_PLACES // cameras) * cameras + camera
+    result: Ints = _pieces(scene, PLACE_M)[unit] % (MAX_PLACES // cameras) * cameras + camera
+    return result
 
 
 def _pieces(scene: Scene, length_m: float) -> Ints:
