@@ -319,7 +319,7 @@ def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss
         warning(
             "standing-still",
             f"the vehicle stands still in {share:.0%} of the places looked at: {listed(where)}",
-            "Leave out frames while it stands: they take time and add nothing.",
+            "Leave them in if it stood there: mapping does without them. Else check which images the frames list.",
         )
     ]
 
