@@ -4,14 +4,15 @@ camera that is turned.
 Both are usual mistakes of recordings: the files of a camera begin a frame late, or lack one from somewhere on, or an
 image is turned by a right angle and its camera in the rig is not. Where cameras have a common view, their matches show
 it, or that there are none although either camera matches its own images of other times. A drive of this kind is refused
-with what was found: whatever is made of it hangs on a rig that the car does not have.
+with what was found: whatever is made of it hangs on a rig that the car does not have. What neither another time nor a
+turn explains is a finding: as a lens that is given wrong, or images that are mirrored.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Container, Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -32,6 +33,7 @@ from mrasfm_engine.matching.calibration_check import (
 from mrasfm_engine.matching.prepared_images import Matcher
 from mrasfm_engine.matching.relisted_images import MIN_UNITS, RelistedImages
 from mrasfm_engine.matching.simultaneous import (
+    CLEARLY_GIVEN,
     are_simultaneous,
     calibration_sigmas,
     largest_turn_rad,
@@ -41,6 +43,7 @@ from mrasfm_engine.matching.verification import essential_inliers
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.types import Cancel, Floats, Ints
+from schemas.findings import Finding, warning
 
 SEARCHED_UNITS = 8
 STEADY_TURN_DEG = 1.0
@@ -49,10 +52,14 @@ WIDE_VIEW = 0.5  # of both cameras' views that the other one has: such cameras' 
 
 @dataclass(frozen=True, kw_only=True)
 class _Comparison:
-    """Units (n,) of two cameras, and the share (n,) of their matches that fits the rig as given or as corrected."""
+    """Units (n,) of two cameras, and the share (n,) of their matches that fits the rig as given or as corrected.
+
+    Cameras with a wide view in common have most of their views in common, and matches are expected.
+    """
 
     units: Ints
     shares: Floats
+    wide_view: bool = False
 
     @property
     def share(self) -> float:
@@ -85,7 +92,7 @@ class _Comparison:
         return self._at(np.arange(first if first >= MIN_UNITS else 0, end if count - end >= MIN_UNITS else count))
 
     def _at(self, rows: Ints) -> _Comparison:
-        return _Comparison(units=self.units[rows], shares=self.shares[rows])
+        return replace(self, units=self.units[rows], shares=self.shares[rows])
 
 
 def require_images_as_listed(
@@ -99,7 +106,7 @@ def require_images_as_listed(
     max_depth_m: float,
     rig_from_cam: Floats | None = None,
     cancel: Cancel | None = None,
-) -> None:
+) -> Finding | None:
     """Refuse a drive one of whose cameras is late by whole frames, or turned by far more than it could be by chance.
 
     Cameras whose simultaneous images fit the calibration as given, or as corrected by all of them, cost next to
@@ -119,6 +126,11 @@ def require_images_as_listed(
     rig_from_cam
         Poses (c, 4, 4) of the cameras as their simultaneous images correct them.
 
+    Returns
+    -------
+    Finding | None
+        Two cameras that contradict the calibration all along, which neither explains.
+
     Raises
     ------
     InputError
@@ -129,7 +141,7 @@ def require_images_as_listed(
     contradicted = {cameras: run for cameras, found in compared.items() if (run := found.contradicting()) is not None}
     looked_at = {**_unlinked(drive, pairs), **contradicted}
     if not looked_at:
-        return
+        return None
     searches = {
         cameras: RelistedImages(
             drive,
@@ -152,8 +164,7 @@ def require_images_as_listed(
             if turns_deg[cameras] < STEADY_TURN_DEG and (lag := searches[cameras].lag())
         }
         if lags:
-            fit = {cameras for cameras, found in compared.items() if found.share >= CLEARLY_BETTER}
-            agree = {camera for cameras in fit - lags.keys() for camera in cameras}
+            agree = _that_agree(compared, but=lags)
             spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
             raise _late(drive, lags, agree, spans)
         sigma_rad = calibration_sigmas(drive, calibration)[0]
@@ -163,6 +174,36 @@ def require_images_as_listed(
             share = compared[cameras].share if cameras in compared else 0.0
             if share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
                 raise _turned(drive, cameras, turns_deg[cameras])
+        shares = {
+            cameras: compared[cameras].share
+            for cameras in contradicted
+            if compared[cameras].share < CLEARLY_GIVEN
+            and (compared[cameras].wide_view or searches[cameras].see_the_same())
+        }
+    return _unexplained(drive, shares, _that_agree(compared, but=shares)) if shares else None
+
+
+def _that_agree(compared: dict[tuple[int, int], _Comparison], *, but: Container[tuple[int, int]]) -> set[int]:
+    """Cameras that fit the calibration with another one, of all pairs but some."""
+    fit = {cameras for cameras, found in compared.items() if found.share >= CLEARLY_BETTER and cameras not in but}
+    return {camera for cameras in fit for camera in cameras}
+
+
+def _unexplained(drive: Drive, shares: dict[tuple[int, int], float], agree: set[int]) -> Finding:
+    """Finding on those of some pairs of cameras whose simultaneous images fit the calibration least, by their share;
+    one that agrees with others is not the wrong one of two."""
+    (a, b), share = min(shares.items(), key=lambda item: item[1])
+    names = [camera.name for camera in drive.cameras]
+    wrong = " and ".join(names[camera] for camera in sorted({a, b} - agree or {a, b}))
+    matches = f"{share:.0%} of their matches" if share else "none of their matches"
+    return warning(
+        "calibration-unexplained",
+        f"simultaneous images of cameras {names[a]} and {names[b]} contradict rig.cameras: {matches} fit, and no "
+        "rotation or other frame explains the others; lengths of the scene may be wrong by far more than is stated",
+        f"Check of {wrong} that params, width and height belong to the images as they are stored, that none are "
+        "mirrored, and rig_from_cam. Nothing needs to be done where the two cannot see the same, as in light and in "
+        "infrared.",
+    )
 
 
 def _unlinked(drive: Drive, pairs: Sequence[PairMatches]) -> dict[tuple[int, int], _Comparison]:
@@ -227,7 +268,8 @@ def _compared(
         if len(shares) >= MIN_UNITS:
             of_rig = np.array([shares[unit] for unit in sorted(shares)]).T
             best = int(np.argmax(np.median(of_rig, axis=1)))
-            result[a, b] = _Comparison(units=np.array(sorted(shares), dtype=np.int64), shares=of_rig[best])
+            units = np.array(sorted(shares), dtype=np.int64)
+            result[a, b] = _Comparison(units=units, shares=of_rig[best], wide_view=(a, b) in expected)
     return result
 
 

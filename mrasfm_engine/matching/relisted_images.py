@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -98,16 +99,26 @@ class RelistedImages:
 
     def turn_deg(self) -> float:
         """Angle by which images show two cameras turned against each other from where they are given; 0 for none."""
-        pairs = [(a, b) for _, a, b in self._pairs(self._units, (0,))]
-        rays = _without_drawn([one for a, b in pairs if (one := self._verified(a, b)) is not None])
+        rays = self._listed
         if len(rays) < MIN_UNITS:
             return 0.0
-        max_error = max_error_rad(self._drive, pairs[0][0], pairs[0][1], self._focal_px, self._config)
+        _, a, b = self._pairs(self._units, (0,))[0]
+        max_error = max_error_rad(self._drive, a, b, self._focal_px, self._config)
         b_from_a = _common_rotation([one.a for one in rays], [one.b for one in rays], max_error)
         if b_from_a is None:
             return 0.0
         given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
         return float(se3.rotation_angle_deg(given.T @ b_from_a))
+
+    def see_the_same(self) -> bool:
+        """True where images of the frames that list them have matches besides those of what is drawn into them."""
+        return len(self._listed) >= MIN_UNITS
+
+    @cached_property
+    def _listed(self) -> list[_Rays]:
+        """Matches of images of the frames that list them, without what is drawn into them."""
+        pairs = [(a, b) for _, a, b in self._pairs(self._units, (0,))]
+        return _without_drawn([one for a, b in pairs if (one := self._verified(a, b)) is not None])
 
     def _pairs(self, units: Ints, lags: Iterable[int]) -> list[tuple[int, int, int]]:
         """Lag and images, by unit: an image is prepared once."""

@@ -136,7 +136,10 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
     """Report of pairs across sub-maps and of those within each; pairs that two of them share were tried in both."""
     by_matches = sorted(reports, key=lambda report: -int(report["simultaneous"]["matches"]))
     contradictions = [report["contradiction"] for report in by_matches if report["contradiction"] is not None]
-    exchanged = [found for report in by_matches if (found := report.get("exchanged_cameras")) is not None]
+    exchanged, unexplained = (
+        [found for report in by_matches if (found := report.get(name)) is not None]
+        for name in ("exchanged_cameras", "unexplained")
+    )
     summed = _summed([{name: report[name] for name in _COUNTED} for report in reports])
     return {
         **summed,
@@ -146,6 +149,7 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
         "simultaneous": by_matches[0]["simultaneous"],
         "contradiction": next(iter(contradictions), None),
         "exchanged_cameras": next(iter(exchanged), None),
+        "unexplained": next(iter(unexplained), None),
     }
 
 

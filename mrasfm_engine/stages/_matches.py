@@ -57,7 +57,7 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
             cancel=run.cancel,
         )
         exchanged = exchanged_by_motion(run.drive, found, result.pairs, cancel=run.cancel)
-        require_images_as_listed(
+        unexplained = require_images_as_listed(
             run.drive,
             found,
             result.pairs,
@@ -72,6 +72,7 @@ def match(run: Run, found: Sequence[ImageFeatures], known: PriorTrajectory) -> t
         return {
             **describe_matches(run.drive, result),
             "exchanged_cameras": None if exchanged is None else as_json(exchanged),
+            "unexplained": None if unexplained is None else as_json(unexplained),
         }
 
     return run.large_stage(Stage.MATCHES, match_settings(run), work)
@@ -122,7 +123,8 @@ def require_matches(run: Run, report: Mapping[str, Any]) -> None:
     ReconstructionError
         Where nothing matches.
     """
-    findings = report["contradiction"], report.get("exchanged_cameras")  # stored reports may lack the latter
+    # Stored reports may lack all but the first.
+    findings = report["contradiction"], report.get("exchanged_cameras"), report.get("unexplained")
     run.report["findings"] += [finding for finding in findings if finding is not None]
     if not report["verified_pairs"]:
         raise ReconstructionError(

@@ -17,6 +17,7 @@ from mrasfm_engine.matching.pair_matching import match_pairs
 from mrasfm_engine.matching.relisted_images import MAX_LAG, _common_rotation
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
+from schemas.findings import Finding
 from tests.helpers.simulated_drive import make_drive, random_descriptors
 from tests.helpers.slow import slow
 
@@ -39,7 +40,7 @@ class Street:
     features: list[ImageFeatures]
     calibration: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
 
-    def check(self, *, cancel: bool = False) -> None:
+    def check(self, *, cancel: bool = False) -> Finding | None:
         images = self.drive.images
         pairs = np.array(
             [
@@ -51,7 +52,7 @@ class Street:
         )
         matcher = NearestNeighbourMatcher(CONFIG)
         found = match_pairs(self.drive, self.features, pairs, matcher, CONFIG, self.calibration, threads=1)
-        require_images_as_listed(
+        return require_images_as_listed(
             self.drive,
             self.features,
             found.pairs,
@@ -119,7 +120,7 @@ def turned(camera: int, axis: tuple[float, float, float], turn_deg: float, *, ca
 
 @pytest.mark.parametrize("cameras", [2, 3])
 def test_images_that_are_listed_as_they_were_taken_pass(cameras: int) -> None:
-    street(cameras=cameras).check()
+    assert street(cameras=cameras).check() is None
 
 
 @pytest.mark.parametrize("lag", [-1, MAX_LAG, *slow(1, 2)])
@@ -140,12 +141,27 @@ def test_a_camera_that_is_late_by_so_much_that_it_sees_other_things_is_refused_w
     assert f"listed {abs(lag)} frames {'before' if lag > 0 else 'after'} them, and not" in caught.value.what
 
 
-def test_cameras_that_match_nowhere_are_not_late() -> None:
-    """One of them looks through a filter, as it were: both match themselves, and neither the other."""
+def test_cameras_that_match_nowhere_are_not_late_but_a_finding() -> None:
+    """One of them looks through a filter, or is mirrored: both match themselves, and neither the other."""
     made = street(units=24, speed_m=0.8, turn_deg=0.4)
     other = street(units=24, speed_m=0.8, turn_deg=0.4, seed=1)
     images = zip(made.drive.images, made.features, other.features, strict=True)
-    Street(made.drive, [b if image.camera == 1 else a for image, a, b in images]).check()
+    found = Street(made.drive, [b if image.camera == 1 else a for image, a, b in images]).check()
+    assert found is not None
+    assert found.code == "calibration-unexplained"
+    assert "none of their matches fit" in found.what
+    assert "Check of camera0 and camera1 that" in found.remedy
+
+
+@pytest.mark.parametrize("focal", [0.9, 1.1])
+def test_a_focal_length_that_is_wrong_by_a_tenth_is_a_finding(focal: float) -> None:
+    params = np.array([[FOCAL_PX, FOCAL_PX, WIDTH / 2, HEIGHT / 2]] * 3)
+    params[2, :2] *= focal
+    found = replace(street(cameras=3), drive=make_drive(looking_ahead(3), params, units=UNITS)).check()
+    assert found is not None
+    assert found.code == "calibration-unexplained"
+    assert "camera2 contradict rig.cameras" in found.what
+    assert "Check of camera2 that" in found.remedy
 
 
 @pytest.mark.parametrize(
@@ -187,11 +203,11 @@ def test_cameras_behind_each_other_that_look_aside_into_open_country_pass(apart_
     given[1, :3, :3] = given[1, :3, :3] @ se3.exp_so3([0.0, np.radians(off_deg), 0.0])
     x, y, z = rng.uniform(-150, 150, POINTS), rng.uniform(20, 300, POINTS), rng.uniform(-5, 30, POINTS)
     far = np.stack([x, y, z], 1)
-    street(true=true, given=given, points=far, noise_px=0.7, turn_deg=0.3).check()
+    assert street(true=true, given=given, points=far, noise_px=0.7, turn_deg=0.3).check() is None
 
 
 def test_one_frame_that_is_late_is_left_to_the_mapping() -> None:
-    street(late=1, lag=1, late_units=range(6, 8)).check()
+    assert street(late=1, lag=1, late_units=range(6, 8)).check() is None
 
 
 def test_of_three_cameras_the_late_one_is_named() -> None:
@@ -240,17 +256,17 @@ def test_cameras_close_to_one_another_are_not_turned_by_half_a_turn(apart_m: flo
 
 
 def test_cameras_that_look_apart_pass() -> None:
-    street(true=turned(1, (0, 1, 0), 180.0)).check()
-    street(true=turned(1, (0, 1, 0), 90.0)).check()
+    assert street(true=turned(1, (0, 1, 0), 180.0)).check() is None
+    assert street(true=turned(1, (0, 1, 0), 90.0)).check() is None
 
 
 @pytest.mark.parametrize("turn_deg", [1.0, 5.0, 18.0])
 def test_a_camera_that_is_a_little_off_is_left_to_the_calibrations_own_estimate(turn_deg: float) -> None:
-    street(given=turned(1, (1, 0, 0), turn_deg)).check()
+    assert street(given=turned(1, (1, 0, 0), turn_deg)).check() is None
 
 
 def test_a_vehicle_that_stands_shows_no_lag() -> None:
-    street(late=1, lag=1, speed_m=0.0, given=turned(1, (1, 0, 0), 3.0)).check()
+    assert street(late=1, lag=1, speed_m=0.0, given=turned(1, (1, 0, 0), 3.0)).check() is None
 
 
 def test_a_declared_uncertainty_of_the_rotations_is_left_to_the_estimate() -> None:
@@ -263,7 +279,7 @@ def test_a_declared_uncertainty_of_the_rotations_is_left_to_the_estimate() -> No
 @pytest.mark.parametrize("off_deg", [-3.0, 3.0])
 def test_a_camera_that_is_turned_by_as_much_as_the_vehicle_turns_in_a_frame_is_not_late(off_deg: float) -> None:
     """On a ramp, where only the place of the cameras between two frames tells both apart."""
-    street(given=turned(1, (0, 1, 0), off_deg), speed_m=0.2, turn_deg=3.0, steady=True).check()
+    assert street(given=turned(1, (0, 1, 0), off_deg), speed_m=0.2, turn_deg=3.0, steady=True).check() is None
 
 
 @pytest.mark.parametrize(("moved_px", "scale"), [((0, 0), 1.0), ((30, 0), 1.0), ((0, 300), 1.0), ((40, 10), 0.8)])
@@ -285,7 +301,7 @@ def test_what_is_drawn_into_all_images_turns_no_camera(moved_px: tuple[float, fl
                 colors=np.zeros((150, 3), dtype=np.uint8),
             )
         )
-    Street(drive, features).check()
+    assert Street(drive, features).check() is None
 
 
 def test_the_search_ends_when_it_is_cancelled() -> None:
