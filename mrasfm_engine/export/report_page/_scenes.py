@@ -35,6 +35,18 @@ from mrasfm_engine.scene.scene import Scene
 from schemas.artifacts import PICTURES_FOLDER, Stage, road_not_drawn
 
 MOST_NAMED = 12
+# Findings on a calibration that images contradict: also where, as of two cameras, none is the wrong one.
+AGAINST_CALIBRATION = frozenset(
+    {
+        "calibration-contradicted",
+        "calibration-unexplained",
+        "camera-against-rig",
+        "camera-miscalibrated",
+        "camera-without-points",
+        "cameras-backwards",
+        "focal-beyond-prior",
+    }
+)
 
 
 def scene_page(scene: Scene, folder: Path, report: Mapping[str, Any], calibration: Mapping[str, Any]) -> str:
@@ -75,6 +87,8 @@ def _verdicts(
     wrong = [name for name, camera in calibration["cameras"].items() if camera["wrong"]]
     if wrong:
         yield verdict("bad", f"not mounted as given: {text(', '.join(wrong))}")
+    elif any(finding["code"] in AGAINST_CALIBRATION for finding in findings):
+        yield verdict("warn", "images contradict the calibration, see findings")
     else:
         yield verdict("good", "no camera contradicts its calibration")
     if summary["georeferenced"]:

@@ -23,7 +23,7 @@ from mrasfm_engine.export.scene import write_scene
 from schemas.artifacts import REPORT_PAGE
 from tests.helpers.export_example import make_scene
 
-REPORT = {
+REPORT: dict[str, Any] = {
     "engine_version": "1.2.3",
     "drive": "ring <road>",
     "findings": [{"severity": "warning", "code": "gnss-jump", "what": "GNSS jumps & returns", "remedy": "Nothing."}],
@@ -117,6 +117,19 @@ def test_a_wrong_camera_is_flagged_and_no_other(tmp_path: Path) -> None:
     assert len(rows) == 4
     assert {(row["data-camera"], row["data-wrong"]) for row in rows} == {("left", "false"), ("right", "true")}
     assert {row["data-camera"] for row in rows if row.get("class") == "wrong"} == {"right"}
+
+
+@pytest.mark.parametrize("code", ["camera-miscalibrated", "calibration-contradicted", "calibration-unexplained"])
+def test_a_calibration_that_a_finding_says_is_contradicted_is_not_called_good(
+    tmp_path: Path, page: str, code: str
+) -> None:
+    """Of two cameras that contradict each other none is the wrong one."""
+    good = "no camera contradicts its calibration"
+    assert good in page
+    write_scene(make_scene(), tmp_path / "scene", REPORT | {"findings": [REPORT["findings"][0] | {"code": code}]})
+    contradicted = (tmp_path / "scene" / REPORT_PAGE).read_text()
+    assert good not in contradicted
+    assert "images contradict the calibration, see findings" in contradicted
 
 
 def test_the_reason_for_a_missing_picture_is_shown(tmp_path: Path) -> None:
