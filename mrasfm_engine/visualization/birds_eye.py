@@ -35,7 +35,7 @@ from mrasfm_engine.visualization.road_picture import (
     finish_road,
     painting_road,
 )
-from mrasfm_engine.visualization.views import GIVEN, REFINED, Painter, paint_views
+from mrasfm_engine.visualization.views import GIVEN, MIN_RESOLUTION_PX, REFINED, Painter, paint_views
 from schemas import LabelMap, SemanticClass
 
 BEFORE, AFTER = "birds_eye_before.png", "birds_eye_after.png"
@@ -72,7 +72,7 @@ def birds_eye(
     Returns
     -------
     BirdsEye
-        Without pictures where no ground was found or no camera sees it; `report["not_drawn"]` then says why.
+        Without pictures where no ground was found or no image shows it finely; `report["not_drawn"]` then says why.
     """
     plan = plan_of(scene, seed=seed)
     if isinstance(plan, str):
@@ -93,7 +93,8 @@ def birds_eye(
         )
         mosaic, *plots = painter.mosaics()
         if not mosaic.images_used:
-            return BirdsEye(report={"not_drawn": "no camera sees the road"})
+            finest = f"{MIN_RESOLUTION_PX:g} pixels a metre or more"
+            return BirdsEye(report={"not_drawn": f"no image shows ground beside the car itself by {finest}"})
         pool = stack.enter_context(ThreadPoolExecutor(2))  # ends before the road's files go
         finishing = None
         if scratch is not None:

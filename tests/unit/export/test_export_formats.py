@@ -240,9 +240,9 @@ def test_what_a_scene_does_not_have_is_refused_before_anything_is_written(
         _exported(scene_folder, "kitti", "geotiff")
     assert found.value.code == "no-picture"
     report = json.loads((scene_folder / "report.json").read_text())
-    stage = {"stage": "pictures", "birds_eye": {"not_drawn": "no camera sees the road"}}
+    stage = {"stage": "pictures", "birds_eye": {"not_drawn": "no image shows ground"}}
     (scene_folder / "report.json").write_text(json.dumps(report | {"stages": [stage]}))
-    with pytest.raises(InputError, match=r"has no pictures/road.tif: no camera sees the road") as found:
+    with pytest.raises(InputError, match=r"has no pictures/road.tif: no image shows ground") as found:
         _exported(scene_folder, "geotiff")
     for crs in ("EPSG:1", "EPSG:4326", "EPSG:2263"):  # unknown, in degrees, of another continent
         with pytest.raises(InputError, match="EPSG:") as found:

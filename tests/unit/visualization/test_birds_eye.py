@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from mrasfm_engine.visualization.agreement import Agreement, why_not_better
 from mrasfm_engine.visualization.birds_eye import EMPTY, MIN_SECOND_SHARE, birds_eye, chequerboard
@@ -10,6 +13,8 @@ from mrasfm_engine.visualization.drawing import framed
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic
 from mrasfm_engine.visualization.views import REFINED
 from tests.helpers.export_example import make_scene
+
+LENSES = {"PINHOLE": 0, "OPENCV": 4}  # number of parameters besides focal lengths and principal point
 
 
 def test_a_scene_without_ground_is_not_drawn() -> None:
@@ -22,6 +27,19 @@ def test_a_scene_without_units_is_not_drawn() -> None:
     scene = make_scene()
     scene.unit_registered[:] = False
     assert birds_eye(scene).report == {"not_drawn": "no unit is registered"}
+
+
+def test_ground_that_no_image_shows_finely_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cameras see it from 9 m on, as in small images that end a little below the horizon."""
+    rng = np.random.default_rng(0)
+    on_ground = np.column_stack([rng.uniform(-5, 20, 4000), rng.uniform(-6, 6, 4000), rng.normal(0, 0.01, 4000)])
+    image = np.full((600, 960, 3), 90, np.uint8)
+    monkeypatch.setattr("mrasfm_engine.visualization.birds_eye.read_view", lambda scene, index: (image, None))
+    for focal_px, middle_px, drawn in ((800.0, 300.0, True), (200.0, 565.0, False)):
+        models = {model: [focal_px, focal_px, 480.0, middle_px, *[0.0] * extra] for model, extra in LENSES.items()}
+        report = birds_eye(replace(make_scene(models=models), points_m=on_ground)).report
+        assert ("not_drawn" not in report) == drawn
+    assert "by 5 pixels a metre" in report["not_drawn"]
 
 
 def test_the_frame_keeps_the_picture_and_draws_a_scale_of_the_right_length() -> None:
