@@ -70,6 +70,7 @@ SIGMA_SPEED = np.log(6.0) / 2.0  # so that both are two standard deviations away
 SIGMA_SPEED_CHANGES = np.log(2.0)
 SIGMA_TURN = 0.5  # rad: images that match are turned by hardly more than a view, 60 deg, which are two sigmas
 SIGMA_DIRECTION = 1.0  # rad about each axis: of any direction it is 1.2, so this is next to no prior
+OPPOSITE_DEG = 90.0  # between directions of motion: two cameras that see the vehicle drive in opposite ones
 UNKNOWNS = 7  # of a motion: its turn, the turn of its direction, and the logarithm of its length
 
 
@@ -122,12 +123,20 @@ def motion_contradiction(names: Sequence[str], given: Floats, found: MotionEstim
         float(np.degrees(of_cameras[a, b]))
         for of_cameras in (turned_between(given, found.rig_from_cam), found.apart_before_rad, found.apart_rad)
     )
+    remedy = (
+        "Mapping begins with the corrected rotations; take the result from calibration.json, and check the mounting."
+    )
+    if after > OPPOSITE_DEG:
+        remedy = (
+            "Look at the images of both: one that sees the vehicle drive backwards, also as corrected, has mirrored "
+            "images or those of another camera, and its rotation in calibration.json is worth nothing."
+        )
     return warning(
         "calibration-contradicted",
         f"the vehicle's motion shows cameras {names[a]} and {names[b]} turned by {turned:.2f} deg against each other "
         f"from where rig.cameras says: in {found.motions} motions the directions in which they see it move differ by "
         f"{before:.1f} deg (median), by {after:.1f} deg as corrected",
-        "Mapping begins with the corrected rotations; take the result from calibration.json, and check the mounting.",
+        remedy,
     )
 
 

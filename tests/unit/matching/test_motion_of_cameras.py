@@ -101,6 +101,24 @@ def test_a_camera_without_a_common_view_that_is_turned_is_found(pitch_deg: float
     assert "front and back_left turned by" in finding.what
 
 
+@pytest.mark.parametrize(("after_deg", "says"), [(4.0, "Mapping begins"), (174.0, "mirrored")])
+def test_a_correction_that_leaves_two_cameras_driving_opposite_ways_is_not_taken_for_the_cause(
+    after_deg: float, says: str
+) -> None:
+    given = np.tile(np.eye(4), (2, 1, 1))
+    corrected = se3.transform(se3.exp_so3(np.radians([[0.0, 0.0, 3.0], [0.0, 0.0, 0.0]])), np.zeros((2, 3)))
+    apart = 1.0 - np.eye(2)
+    found = MotionEstimate(
+        rig_from_cam=corrected,
+        motions=24,
+        apart_before_rad=np.radians(176.0) * apart,
+        apart_rad=np.radians(after_deg) * apart,
+    )
+    finding = motion_contradiction(["left", "right"], given, found)
+    assert finding is not None
+    assert says in finding.remedy
+
+
 def test_roll_about_a_straight_street_stays_as_given() -> None:
     """No motion shows it, and a correction of another axis brings none of it."""
     simulated = turned([6.0, 6.0, 0.0])
