@@ -163,7 +163,7 @@ def large_share_finding(camera: str, mask: Bools | None) -> list[Finding]:
     return [
         warning(
             "own-car-large",
-            f"{share:.0%} of the images of camera {camera} stay while the vehicle moves and are left out",
+            f"{share:.0%} of the area of every image of camera {camera} stays while the vehicle moves and is left out",
             f"Look at own_car/{camera}.png of the scene; if it covers more than the vehicle itself, set "
             "`own_car = false` under [features] and give masks.",
         )
