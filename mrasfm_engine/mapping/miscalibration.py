@@ -126,6 +126,7 @@ def finding(name: str, wrong: Miscalibration) -> Finding:
         f"camera {name} is turned by {wrong.rotation_deg:.2f} deg and moved by {wrong.translation_m:.3f} m from where "
         f"rig.cameras says; the other cameras by {wrong.others_rotation_deg:.2f} deg and "
         f"{wrong.others_translation_m:.3f} m as a rule",
+        "Check first that params and images are its own, and not mirrored or turned: no pose is right for others. "
         "It was recalibrated: take its pose from calibration.json, and check how it is mounted.",
     )
 
@@ -137,5 +138,6 @@ def pair_finding(names: Sequence[str], wrong: MiscalibratedPair) -> Finding:
         f"cameras {names[0]} and {names[1]} are turned by {wrong.rotation_deg:.2f} deg and moved by "
         f"{wrong.translation_m:.3f} m against each other from where rig.cameras says; which of them is wrong, two "
         "cameras do not tell",
+        "Check first that params and images are their own, and not mirrored or turned: no pose is right for others. "
         "They were recalibrated: take their poses from calibration.json, and check how both are mounted.",
     )

@@ -105,6 +105,7 @@ def test_a_finding_says_which_camera_and_by_how_much() -> None:
     assert said.code == "camera-miscalibrated"
     assert "camera back_right is turned by 2.96 deg and moved by 0.012 m" in said.what
     assert "calibration.json" in said.remedy
+    assert "Check first that params and images are its own" in said.remedy
 
 
 def test_votes_in_units_with_covered_images_blame_no_camera() -> None:
