@@ -198,8 +198,9 @@ def _unexplained(drive: Drive, shares: dict[tuple[int, int], float], agree: set[
     matches = f"{share:.0%} of their matches" if share else "none of their matches"
     return warning(
         "calibration-unexplained",
-        f"simultaneous images of cameras {names[a]} and {names[b]} contradict rig.cameras: {matches} fit, and no "
-        "rotation or other frame explains the others; lengths of the scene may be wrong by far more than is stated",
+        f"simultaneous images of cameras {names[a]} and {names[b]} contradict rig.cameras: {matches} fit, and "
+        "neither another frame nor a correction of rotations explains the others; lengths of the scene may be wrong by "
+        "far more than is stated",
         f"Check of {wrong} that params, width and height belong to the images as they are stored, that none are "
         "mirrored, and rig_from_cam. Nothing needs to be done where the two cannot see the same, as in light and in "
         "infrared.",
