@@ -90,7 +90,7 @@ def _verdicts(
         named = "; ".join(f"{', '.join(cameras)} in {name}" for name, cameras in wrong.items())
         yield verdict("bad", f"not mounted as given: {text(named)}")
     elif calibrations:
-        yield verdict("good", "no camera contradicts its calibration")
+        yield verdict("good", "no single camera contradicts its calibration")
     fit_nowhere = {scene["name"] for scene in document["left_out"]}
     failed = [name for drive in report.get("failed_drives", ()) if (name := drive["name"]) not in fit_nowhere]
     if failed:

@@ -62,7 +62,7 @@ def scene_page(scene: Scene, folder: Path, report: Mapping[str, Any], calibratio
     stages, summary = report.get("stages", ()), report["summary"]
     name = str(report.get("drive", scene.drive.manifest.name))
     refinement = stage_of(stages, Stage.REFINEMENT)
-    lines = list(_verdicts(summary, calibration, refinement, report.get("findings", ())))
+    lines = list(_verdicts(report, calibration, refinement))
     return page(
         f"{name}: scene",
         [
@@ -80,8 +80,9 @@ def scene_page(scene: Scene, folder: Path, report: Mapping[str, Any], calibratio
 
 
 def _verdicts(
-    summary: Mapping[str, Any], calibration: Mapping[str, Any], refinement: Mapping[str, Any], findings: Sequence[Any]
+    report: Mapping[str, Any], calibration: Mapping[str, Any], refinement: Mapping[str, Any]
 ) -> Iterator[str]:
+    summary, findings = report["summary"], report.get("findings", ())
     yield share_verdict(summary, "units")
     yield share_verdict(summary, "images")
     wrong = [name for name, camera in calibration["cameras"].items() if camera["wrong"]]
@@ -94,7 +95,9 @@ def _verdicts(
     if summary["georeferenced"]:
         yield verdict("good", "placed on the earth by GNSS")
     else:
-        yield verdict("warn", "not placed on the earth: no GNSS that could be used")
+        is_asked = not report.get("settings", {}).get("use_gnss", True)
+        why = "GNSS is left out, as the settings ask" if is_asked else "no GNSS that could be used"
+        yield verdict("warn", f"not placed on the earth: {why}")
     sigma = refinement.get("scale", {}).get("sigma_relative")
     if sigma is not None:
         yield verdict("good" if sigma < 0.02 else "warn", f"sigma of the scale {number(100 * sigma, '%')}")

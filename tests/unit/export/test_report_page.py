@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -130,6 +131,15 @@ def test_a_calibration_that_a_finding_says_is_contradicted_is_not_called_good(
     contradicted = (tmp_path / "scene" / REPORT_PAGE).read_text()
     assert good not in contradicted
     assert "images contradict the calibration, see findings" in contradicted
+
+
+@pytest.mark.parametrize(
+    ("use_gnss", "why"), [(True, "no GNSS that could be used"), (False, "GNSS is left out, as the settings ask")]
+)
+def test_the_reason_why_a_scene_is_not_on_the_earth(tmp_path: Path, use_gnss: bool, why: str) -> None:
+    scene = replace(make_scene(), georeference=None)
+    write_scene(scene, tmp_path / "scene", REPORT | {"settings": {"use_gnss": use_gnss}})
+    assert f"not placed on the earth: {why}" in (tmp_path / "scene" / REPORT_PAGE).read_text()
 
 
 def test_the_reason_for_a_missing_picture_is_shown(tmp_path: Path) -> None:

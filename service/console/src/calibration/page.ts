@@ -32,7 +32,7 @@ export function Cameras({ document }: { document: Calibration }): Shown {
   return html`<p>${state}.</p>
     ${wrong.length > 0
       ? html`<div class="box bad" role="alert"><strong>Not mounted as given: ${wrong.join(", ")}</strong><p>The images contradict the calibration of ${wrong.length === 1 ? "this camera" : "these cameras"}. Calibrate anew, or use the refined values where their sigma suffices.</p></div>`
-      : html`<p><span class="badge good">no camera contradicts its calibration</span></p>`}
+      : html`<p><span class="badge good">no single camera contradicts its calibration</span></p>`}
     <${Corrections} document=${document} what="rotation" unit="deg" title="Correction of the rotation about the rig's axes" />
     <${Corrections} document=${document} what="translation" unit="m" title="Correction of the position along the rig's axes" />
     <p class="muted small">± is one sigma. Observed: the drive's images and positions determine this direction. Only the prior: they do not, and the value is the given one within its uncertainty.</p>
