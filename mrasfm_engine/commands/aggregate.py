@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 
 from mrasfm_engine.commands.named_path import split_name
-from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, print_report
+from mrasfm_engine.commands.reconstruct import cancel_on_interrupt, print_findings, print_report
 from mrasfm_engine.commands.stage_progress import stage_progress
 from mrasfm_engine.config import read_config
 from mrasfm_engine.errors import InputError
@@ -92,5 +92,4 @@ def _say(report: dict[str, Any], document: dict[str, Any], out: Path) -> None:
             )
         else:
             print(f"  no seam {seam['a']} - {seam['b']}: {seam['reason']}")
-    for finding in report["findings"]:
-        print(f"  {finding['severity']}: {finding['what']}")
+    print_findings(report["findings"])

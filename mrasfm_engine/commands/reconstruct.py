@@ -7,7 +7,7 @@ import json
 import signal
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import groupby
 from pathlib import Path
@@ -74,6 +74,12 @@ def print_report(out: Path) -> None:
     print(json.dumps(json.loads((out / REPORT_FILE).read_text(encoding="utf-8")), ensure_ascii=False))
 
 
+def print_findings(findings: Sequence[Mapping[str, Any]]) -> None:
+    """Print the findings of a report, each with its remedy below it."""
+    for finding in findings:
+        print(f"  {finding['severity']}: {finding['what']}\n    {finding['remedy']}".rstrip())
+
+
 @contextmanager
 def cancel_on_interrupt(console: Console) -> Iterator[Callable[[], bool]]:
     """Ctrl-C or SIGTERM asks the run to stop where it leaves nothing half-written; a second one stops at once.
@@ -137,8 +143,7 @@ def _say(report: dict[str, Any], out: Path) -> None:
         print(f"  road from above:  {_birds_eye(stages['pictures']['birds_eye'], out)}")
     for camera, images in Counter(image["camera"] for image in mapping["images_occluded"]).items():
         print(f"  occluded:         {camera} in {images} images, by something that moves along")
-    for finding in report["findings"]:
-        print(f"  {finding['severity']}: {finding['what']}")
+    print_findings(report["findings"])
     for frames, reason in _missing(mapping["units_not_registered"]):
         print(f"  not registered:   {frames}: {reason}")
 
@@ -173,4 +178,4 @@ def _birds_eye(seen: dict[str, Any], out: Path) -> str:
     if "not_compared" in seen:
         return f"{out / 'pictures'} ({seen['not_compared']})"
     before, after = (seen[name]["correlation"] for name in ("before", "after"))
-    return f"{out / 'pictures'}; correlation of two cameras {before:.2f} as given, {after:.2f} now"
+    return f"{out / 'pictures'}; views of two cameras correlate by {before:.2f} as given, {after:.2f} now, of 1 at most"
