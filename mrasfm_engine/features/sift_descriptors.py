@@ -42,7 +42,7 @@ def _add_gradients(magnitude: Any, direction: Any, keypoint: Any, offsets: Any, 
     """Add the gradients around a keypoint to its histograms (36 cells x 9 directions, flat).
 
     `keypoint` has x, y, the side of a cell and the direction, in pixels of the gradients (h, w) and radians; `offsets`
-    and `weights` (w,) are work space. All arithmetic is in float32, for twice the numbers in a register.
+    and `weights` (w,) are work space. What is done for each pixel is in float32, for twice the numbers in a register.
     """
     height, width = magnitude.shape
     x, y, side, angle = keypoint

@@ -20,7 +20,14 @@ from mrasfm_engine.scene.semantics import count_classes
 from mrasfm_engine.scene.submaps import share_a_submap
 from mrasfm_engine.stages._features import describe_features, left_out_of, require_features
 from mrasfm_engine.stages._mapping import MappedDrive, map_once, mapping_of, packed
-from mrasfm_engine.stages._matches import describe_matches, match_settings, read_pairs, require_matches, write_pairs
+from mrasfm_engine.stages._matches import (
+    FINDINGS,
+    describe_matches,
+    match_settings,
+    read_pairs,
+    require_matches,
+    write_pairs,
+)
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.stages._submap_run import SubmapRun
 from mrasfm_engine.triangulation.tracks import Keypoints
@@ -135,11 +142,10 @@ def _unlike_images(submap: SubmapRun, found: JoinedFeatures) -> Bools:
 def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[PairMatches]) -> dict[str, Any]:
     """Report of pairs across sub-maps and of those within each; pairs that two of them share were tried in both."""
     by_matches = sorted(reports, key=lambda report: -int(report["simultaneous"]["matches"]))
-    contradictions = [report["contradiction"] for report in by_matches if report["contradiction"] is not None]
-    exchanged, unexplained = (
-        [found for report in by_matches if (found := report.get(name)) is not None]
-        for name in ("exchanged_cameras", "unexplained")
-    )
+    findings = {
+        name: next((found for report in by_matches if (found := report.get(name)) is not None), None)
+        for name in FINDINGS
+    }
     summed = _summed([{name: report[name] for name in _COUNTED} for report in reports])
     return {
         **summed,
@@ -147,9 +153,7 @@ def _joined_match_report(reports: Sequence[dict[str, Any]], pairs: Sequence[Pair
         "matches": sum(len(pair.matches) for pair in pairs),
         "verified_matches": sum(int(pair.inliers.sum()) for pair in pairs),
         "simultaneous": by_matches[0]["simultaneous"],
-        "contradiction": next(iter(contradictions), None),
-        "exchanged_cameras": next(iter(exchanged), None),
-        "unexplained": next(iter(unexplained), None),
+        **findings,
     }
 
 

@@ -22,6 +22,7 @@ from schemas.artifacts import Stage
 from schemas.findings import as_json
 
 PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
+FINDINGS = ("contradiction", "exchanged_cameras", "unexplained")  # parts of the report that are one, or none
 WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 
 
@@ -123,9 +124,7 @@ def require_matches(run: Run, report: Mapping[str, Any]) -> None:
     ReconstructionError
         Where nothing matches.
     """
-    # Stored reports may lack all but the first.
-    findings = report["contradiction"], report.get("exchanged_cameras"), report.get("unexplained")
-    run.report["findings"] += [finding for finding in findings if finding is not None]
+    run.report["findings"] += [finding for name in FINDINGS if (finding := report.get(name)) is not None]
     if not report["verified_pairs"]:
         raise ReconstructionError(
             f"nothing matches: none of {report['candidate_pairs']} image pairs has a verified match",
