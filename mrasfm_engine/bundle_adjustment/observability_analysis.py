@@ -61,6 +61,7 @@ def assess_directions(
     position_m: Floats,
     sigma_rotation_rad: Floats,
     sigma_translation_m: Floats,
+    placed: bool,
     weight: Floats | None = None,
 ) -> Observability:
     """Compare the posterior of all cameras' poses with their prior.
@@ -74,6 +75,9 @@ def assess_directions(
         Places (c, 3) of the cameras in the rig.
     sigma_rotation_rad, sigma_translation_m
         Prior standard deviations (c,) of each axis.
+    placed
+        Whether positions or rough poses place the scene: without them, images and prior alone make the rig's size
+        neither more nor less certain, however the posterior of wrong baselines comes out.
     weight
         Weights (c,) that the prior of places has left in the adjustment, of which cameras far from where they were
         given keep little: positions may well know the length of their baselines better than that.
@@ -84,7 +88,7 @@ def assess_directions(
             observed=np.zeros((cameras, 6), dtype=np.bool_),
             ratio=np.full((cameras, 6), np.inf),
             scale_observed=False,
-            scale_only_prior=False,
+            scale_only_prior=not placed,
             sigma_scale=np.inf,
             prior_sigma_scale=np.inf,
         )
@@ -103,7 +107,7 @@ def assess_directions(
         of_camera = (functional.reshape(cameras, 6) ** 2).sum(1)
         left_scale = 1.0 / float(np.sqrt(of_camera @ (np.ones(cameras) if weight is None else weight)))
         posterior_scale = float(np.sqrt(max(float(functional @ posterior @ functional), 0.0))) / known
-        scale_observed = posterior_scale < OBSERVED_RATIO * prior_scale
+        scale_observed = placed and posterior_scale < OBSERVED_RATIO * prior_scale
         if not scale_observed:
             prior, posterior = _given(prior, functional), _given(posterior, functional)
     own, left = np.diagonal(prior), np.maximum(np.diagonal(posterior), 0.0)
@@ -112,7 +116,7 @@ def assess_directions(
         observed=np.nan_to_num(ratio, nan=np.inf) < OBSERVED_RATIO,
         ratio=ratio,
         scale_observed=scale_observed,
-        scale_only_prior=posterior_scale > ONLY_PRIOR_RATIO * left_scale,
+        scale_only_prior=not placed or posterior_scale > ONLY_PRIOR_RATIO * left_scale,
         sigma_scale=posterior_scale,
         prior_sigma_scale=prior_scale,
     )

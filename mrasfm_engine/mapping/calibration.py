@@ -221,9 +221,15 @@ def of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
 
 
 def observed_directions(
-    mapper: Mapper, certainty: Covariances | None, covariance: Floats | None = None
+    mapper: Mapper, certainty: Covariances | None, covariance: Floats | None = None, *, placed: bool
 ) -> Observability | None:
-    """Directions that the drive observes by its certainty, or by another `covariance` of the calibration."""
+    """Directions that the drive observes by its certainty, or by another `covariance` of the calibration.
+
+    Parameters
+    ----------
+    placed
+        Whether positions or rough poses place the scene.
+    """
     cameras = len(mapper.camera_kind)
     if mapper.drive.has_single_camera or certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
         return None
@@ -233,6 +239,7 @@ def observed_directions(
         position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
+        placed=placed,
         weight=prior.weights_of_places(mapper.state),
     )
 

@@ -103,8 +103,7 @@ def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel
         compare_positions_again(mapper, result, cancel)
     if calibrated is None:
         absolute.doubt_the_rig(mapper)
-    placed = result.georeferenced or result.placed_by_rough_poses
-    if not placed and mapper.drive.has_single_camera:
+    if not result.is_placed and mapper.drive.has_single_camera:
         raise ReconstructionError(
             "one camera tells no scale, and neither GNSS nor rough poses could: "
             + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
@@ -152,7 +151,7 @@ def _decide_what_varies(
 def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cancel | None) -> None:
     """Say how certain everything is, hold what the drive does not observe, and find what is not as it was given."""
     _compare_rough_poses_with_rig(mapper, result)
-    result.directions = observed_directions(mapper, result.certainty)
+    result.directions = observed_directions(mapper, result.certainty, placed=result.is_placed)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
         result.mean_time_varies &= positions_tell_time(mapper, result.certainty)
@@ -209,7 +208,9 @@ def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) ->
         terms=terms_of(mapper, result),
         options=solver_options(mapper, result),
     )
-    found = observed_directions(mapper, covariances(problem, problem.state, shared_errors=False))
+    found = observed_directions(
+        mapper, covariances(problem, problem.state, shared_errors=False), placed=result.is_placed
+    )
     wrong = np.zeros_like(result.recalibrated)
     if found is not None:
         wrong[[one.camera for one in find_miscalibrations(calibration_prior(mapper), mapper.state, found)]] = True
@@ -236,7 +237,10 @@ def _hold_unobserved(
     make uncertain is not held: the adjustment is sure of it, and the whole scene would follow.
     """
     assert result.certainty is not None
-    weighed = observed_directions(mapper, result.certainty, result.certainty.calibration_of_independent_errors)
+    certainty = result.certainty
+    weighed = observed_directions(
+        mapper, certainty, certainty.calibration_of_independent_errors, placed=result.is_placed
+    )
     if weighed is None:
         return
     if result.times is not None:

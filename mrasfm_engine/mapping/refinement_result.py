@@ -91,6 +91,11 @@ class Refinement:
         """The scene stands where the receiver says."""
         return self.absolute.positions is not None
 
+    @property
+    def is_placed(self) -> bool:
+        """Positions or rough poses say where the scene stands, and may say how large it is."""
+        return self.georeferenced or self.placed_by_rough_poses
+
 
 def solver_options(mapper: Mapper, result: Refinement, *, rough: bool = False) -> SolverOptions:
     """Options of adjustments whose observations err as is known by now; `rough` ones end earlier.

@@ -168,6 +168,7 @@ def test_the_common_motion_and_the_scale_of_the_cameras_are_not_observed() -> No
         position_m=case.truth.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
+        placed=False,
     )
     assert verdict.observed[:, :3].all()
     assert not verdict.scale_observed

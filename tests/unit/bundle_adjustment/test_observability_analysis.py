@@ -37,12 +37,13 @@ def axis(camera: int, direction: int) -> np.ndarray:
     return result.ravel()
 
 
-def judge(covariance: np.ndarray, cameras: int = 4):  # type: ignore[no-untyped-def]
+def judge(covariance: np.ndarray, cameras: int = 4, *, placed: bool = True):  # type: ignore[no-untyped-def]
     return assess_directions(
         covariance,
         position_m=PLACES[:cameras],
         sigma_rotation_rad=SIGMA_RAD[:cameras],
         sigma_translation_m=SIGMA_M[:cameras],
+        placed=placed,
     )
 
 
@@ -70,6 +71,13 @@ def test_positions_that_know_the_scale_are_said_to() -> None:
     assert found.scale_observed
     assert found.observed.all()
     assert 0 < found.sigma_scale < 0.05 * found.prior_sigma_scale
+
+
+def test_without_positions_nothing_but_the_prior_knows_the_scale() -> None:
+    """A posterior of images that contradict the baselines may come out smaller than their prior."""
+    found = judge(posterior([growth(PLACES) / np.linalg.norm(growth(PLACES))]), placed=False)
+    assert not found.scale_observed
+    assert found.scale_in_words == "only the prior"
 
 
 @pytest.mark.parametrize(("camera", "direction"), [(1, 5), (2, 0), (0, 4)])
@@ -100,6 +108,7 @@ def test_the_baseline_of_two_cameras_is_their_scale() -> None:
         position_m=PLACES[[1, 2]],
         sigma_rotation_rad=SIGMA_RAD[:2],
         sigma_translation_m=SIGMA_M[:2],
+        placed=True,
     )
     expected = np.ones((2, 6), dtype=np.bool_)
     expected[:, 4] = False
@@ -117,6 +126,7 @@ def test_baselines_that_their_prior_let_go_of_are_not_as_long_as_given() -> None
             position_m=PLACES[[1, 2]],
             sigma_rotation_rad=SIGMA_RAD[:2],
             sigma_translation_m=SIGMA_M[:2],
+            placed=True,
             weight=np.full(2, weight),
         ).scale_only_prior
 
