@@ -142,10 +142,6 @@ class Layout:
         """Length of the reduced vector."""
         return UNIT_DOF * self.num_units + self.camera_dof * self.num_cameras
 
-    def unit_offsets(self, units: Ints) -> Ints:
-        """First index of each (free) unit's step."""
-        return UNIT_DOF * self.unit_slot[units]
-
     def camera_offsets(self, cameras: Ints) -> Ints:
         """First index of each (free) camera's step."""
         return UNIT_DOF * self.num_units + self.camera_dof * self.camera_slot[cameras]

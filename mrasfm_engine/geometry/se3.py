@@ -133,13 +133,6 @@ def inverse_left_jacobian(rotation_vector: ArrayLike) -> Floats:
     return result
 
 
-def log_se3(a_from_b: ArrayLike) -> Floats:
-    """Twists (..., 6) of transforms (..., 4, 4), the inverse of `exp_se3`; angles below pi."""
-    m = np.asarray(a_from_b, dtype=np.float64)
-    w = log_so3(m[..., :3, :3])
-    return np.concatenate([w, (inverse_left_jacobian(w) @ m[..., :3, 3:])[..., 0]], axis=-1)
-
-
 def rotation_angle_deg(rotation: ArrayLike) -> Floats:
     """Angles (...) in degrees, 0 to 180, of rotation matrices (..., 3, 3)."""
     result: Floats = np.degrees(np.linalg.norm(log_so3(rotation), axis=-1))

@@ -48,7 +48,6 @@ def test_twists_and_transforms_agree_with_the_matrix_exponential(angle_rad: floa
     generator[:, :3, :3], generator[:, :3, 3] = se3.skew(twist[:, :3]), twist[:, 3:]
     moved = se3.exp_se3(twist)
     np.testing.assert_allclose(moved, scipy.linalg.expm(generator), atol=1e-12)
-    np.testing.assert_allclose(se3.log_se3(moved), twist, atol=1e-9)
 
 
 def test_small_and_large_angles_meet_at_the_threshold() -> None:
