@@ -316,6 +316,7 @@ def test_a_killed_supervisor_takes_its_children_along(world: World, also_the_gua
 
 def test_a_killed_guard_is_replaced_and_knows_what_to_do(world: World) -> None:
     supervisor = world.start_ready(world.child("worker", body=GRANDCHILD))
+    pids = [world.pid(name) for name in ("worker", "grandchild")]  # what was not begun cannot be left over
     first = world.guard(supervisor)
     first.kill()
     wait_for(lambda: is_gone(first.pid))
@@ -323,8 +324,8 @@ def test_a_killed_guard_is_replaced_and_knows_what_to_do(world: World) -> None:
     assert second.pid != first.pid
     supervisor.kill()
     supervisor.wait()
-    for name in ("worker", "grandchild"):
-        wait_for(lambda name=name: is_gone(world.pid(name)))
+    for pid in pids:
+        wait_for(lambda pid=pid: is_gone(pid))
 
 
 def test_without_its_logs_it_goes_on(world: World) -> None:

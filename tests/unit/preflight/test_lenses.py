@@ -57,6 +57,20 @@ def test_a_principal_point_at_the_edge_is_named(center: tuple[float, float], is_
     assert [text.split(":")[0] for text in found] == (["principal-point"] if is_named else [])
 
 
+@pytest.mark.parametrize(
+    ("center", "times"),
+    [((960.0, 600.0), "2"), ((240.0, 150.0), "0.5"), ((725.0, 440.0), "1.5"), ((490.0, 450.0), None)],
+)
+def test_params_of_images_of_another_size_are_named(center: tuple[float, float], times: str | None) -> None:
+    """Images that were reduced, and params of the whole ones; a cut at the top moves the principal point alone."""
+    found = findings("PINHOLE", [500.0, 500.0, *center])
+    if times is None:
+        assert found == []
+    else:
+        (text,) = found
+        assert f"as in an image {times} times the size of its image of 960x600 pixels" in text
+
+
 def test_a_fold_inside_the_image_is_named_with_its_angle_and_share() -> None:
     # Half of the image is 43 deg wide, the polynomial ends at 31 deg.
     params = [500.0, 500.0, 480.0, 300.0, -0.9, 0.0, 0.0, 0.0]
