@@ -65,15 +65,15 @@ def read_camchain(path: Path) -> list[ChainCamera]:
     try:
         document = YAML(typ="safe", pure=True).load(text.decode("utf-8-sig"))
         chain = _Chain.model_validate(document).root
-    except (YAMLError, UnicodeDecodeError, RecursionError) as error:
-        said = " ".join(str(error).split())[:200]
-        raise InputError(f"calibration {path} is not YAML: {said}", remedy=remedy, code="bad-calibration") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(map(str, first["loc"]))
         raise InputError(
             f"calibration {path}: {where}: {first['msg']}", remedy=remedy, code="bad-calibration"
         ) from None
+    except (YAMLError, ValueError, KeyError, RecursionError) as error:  # a date that is none, a tag that does not fit
+        said = " ".join(str(error).split())[:200]
+        raise InputError(f"calibration {path} is not YAML: {said}", remedy=remedy, code="bad-calibration") from None
     cameras: list[ChainCamera] = []
     for name, camera in chain.items():
         where = f"calibration {path}: {name}"

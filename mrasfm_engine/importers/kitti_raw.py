@@ -204,12 +204,20 @@ def _read_ins(folder: Path) -> tuple[Ints, Floats] | None:
     if not files:
         return None
     times_us = _times_us(folder / "timestamps.txt")
-    numbers = [int(file.stem) for file in files if file.stem.isdecimal()]
-    if len(numbers) != len(files):
-        raise InputError(f"{folder / 'data'} holds a file that is not named by a frame number", remedy="Remove it.")
-    _require_time(folder / "timestamps.txt", times_us, max(numbers))
-    rows = np.concatenate([read_numbers(file, what="oxts", columns=OXTS_COLUMNS)[:1] for file in files])
-    return times_us[numbers], rows
+    if unnumbered := [file for file in files if not file.stem.isdecimal()]:
+        raise InputError(f"{unnumbered[0]} is not named by a frame number", remedy="Remove it.", code="bad-name")
+    files.sort(key=lambda file: int(file.stem))
+    numbers = [int(file.stem) for file in files]
+    _require_time(folder / "timestamps.txt", times_us, numbers[-1])
+    return times_us[numbers], np.stack([_ins_values(file) for file in files])
+
+
+def _ins_values(file: Path) -> Floats:
+    rows = read_numbers(file, what="oxts", columns=OXTS_COLUMNS)
+    if not len(rows):
+        raise InputError(f"oxts {file} has no values", remedy="Unpack the drive again.", code="bad-table")
+    values: Floats = rows[0]
+    return values
 
 
 def _gnss(times_us: Ints, rows: Floats, folder: Path) -> Gnss:

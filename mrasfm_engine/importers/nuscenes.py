@@ -30,7 +30,7 @@ from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.io.documents import read_document
 from mrasfm_engine.types import Floats
 from schemas import Camera
-from schemas.drive import MAX_VEHICLE_CHARACTERS, Finite, RelativePath, Vector3
+from schemas.drive import LAST_TIMESTAMP_US, MAX_VEHICLE_CHARACTERS, Finite, RelativePath, Vector3
 
 DESCRIPTION = "v1.0-*/scene.json (nuScenes)"
 OPTIONS = ("scene", "sweeps")
@@ -40,6 +40,9 @@ FLAT_M = 1e-6  # other data sets come in these tables, too, with heights
 SHUTTER_NOTE = "Shutter: the tables do not say whether a camera reads its rows one after the other."
 _NOT_IN_A_NAME = re.compile(r"[^A-Za-z0-9_.:-]+")
 MAX_TABLE_BYTES = 4_000_000_000  # sample_data.json of the full set has over 1 GB
+
+
+_Timestamp = Annotated[int, Field(ge=0, le=LAST_TIMESTAMP_US)]
 
 
 class _Row(BaseModel):
@@ -60,7 +63,7 @@ class _Log(_Row):
 
 
 class _Sample(_Row):
-    timestamp: int
+    timestamp: _Timestamp
     next: str
     scene_token: str
 
@@ -101,7 +104,7 @@ class _SampleData(_Row):
     sample_token: str
     ego_pose_token: str
     calibrated_sensor_token: str
-    timestamp: int
+    timestamp: _Timestamp
     is_key_frame: bool
     filename: RelativePath
     width: int | None = None
@@ -301,14 +304,14 @@ def _cameras(
 
 def _camera(name: str, data: _SampleData, calibration: _Calibrated, tables: Path) -> Camera:
     source = f"nuScenes tables {tables}: calibrated_sensor {calibration.token} ({name})"
-    k = np.array(calibration.camera_intrinsic or [], dtype=np.float64)
-    if k.shape != (3, 3) or not data.width or not data.height:
+    rows = calibration.camera_intrinsic or []
+    if [len(row) for row in rows] != [3, 3, 3] or not data.width or not data.height:
         raise InputError(f"{source} has no 3x3 camera_intrinsic or image size", remedy="Unpack the tables again.")
     return checked_camera(
         name,
         model="PINHOLE",
         size=(data.width, data.height),
-        params=pinhole_params(k, what=f"{source}: camera_intrinsic"),
+        params=pinhole_params(np.array(rows, dtype=np.float64), what=f"{source}: camera_intrinsic"),
         rig_from_cam=calibration.matrix(),
         source=source,
     )

@@ -14,7 +14,7 @@ from mrasfm_engine.importers.unknown_fields import notes_of_unknown_fields
 from mrasfm_engine.io.documents import read_bytes, read_document
 from mrasfm_engine.types import Floats
 from schemas import GnssSample
-from schemas.drive import MAX_GNSS_SAMPLES, Vector3
+from schemas.drive import LAST_TIMESTAMP_US, MAX_GNSS_SAMPLES, Vector3
 from schemas.manifest_check import MAX_FRAME_INTERVAL_US
 
 GNSS_COLUMNS = (
@@ -188,7 +188,11 @@ def _sample(row: dict[str, str], *, where: str) -> GnssSample:
 
 # Column: lower and upper bound and what to say beyond them.
 _BOUNDS = {
-    "timestamp_us": (0, 2.0**62, "is not a time in microseconds"),
+    "timestamp_us": (
+        0,
+        LAST_TIMESTAMP_US,
+        "is not a time in microseconds up to the year 9999: are these nanoseconds?",
+    ),
     "latitude_deg": (-90, 90, "is not a latitude (-90 to 90): are latitude and longitude swapped?"),
     "longitude_deg": (-180, 180, "is not a longitude (-180 to 180)"),
     "ellipsoidal_height_m": (-1000, 20000, "is not a height on the earth in metres"),
@@ -201,13 +205,13 @@ def _value(text: str, column: str, *, where: str) -> float:
     remedy = "Correct this value, or remove the line."
     lower, upper, complaint = _BOUNDS[column]
     try:
-        value = float(int(text) if column == "timestamp_us" else float(text))
-    except (ValueError, OverflowError):
+        value: float = int(text) if column == "timestamp_us" else float(text)
+    except ValueError:
         kind = "an integer number of microseconds" if column == "timestamp_us" else "a number"
         raise InputError(
             f"{where}, column {column}: {text[:40]!r} is not {kind}", remedy=remedy, code="bad-gnss-file"
         ) from None
-    if not math.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         raise InputError(
             f"{where}, column {column}: {text[:40]} is not a finite number", remedy=remedy, code="bad-gnss-file"
         )

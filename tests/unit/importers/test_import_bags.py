@@ -648,6 +648,9 @@ def test_kalibrs_chain(tmp_path: Path) -> None:
         ("camera_model: pinhole", "camera_model: ds", "cam0: camera_model 'ds' with 4 intrinsics is not known"),
         ("  T_cn_cnm1:", "  T_other:", "cam1: T_cn_cnm1 is missing"),
         ("cam0:", "cam0: [", "is not YAML"),
+        ("/left/image_raw/compressed", "2024-13-45", "camchain.yaml is not YAML: month must be in 1..12"),
+        ("camera_model: pinhole", "camera_model: !!int pinhole", "camchain.yaml is not YAML: invalid literal"),
+        ("camera_model: pinhole", "camera_model: !!bool pinhole", "camchain.yaml is not YAML: 'pinhole'"),
         ("intrinsics: [50.0", "intrinsics: [abc", "cam0.intrinsics.0: Input should be a valid number"),
     ],
 )

@@ -49,6 +49,7 @@ def test_columns_are_found_by_name(tmp_path: Path) -> None:
         (3, "100000,49,8.4,110,0,1", "line 3, column sigma_horizontal_m: 0 must be a standard deviation above zero"),
         (3, "100000,49,8.4,110,0.5,-1", "line 3, column sigma_vertical_m: -1 must be"),
         (3, "1" + "0" * 400 + ",49,8.4,110,0.5,1", "line 3, column timestamp_us"),
+        (3, "1714730400000000000,49,8.4,110,0.5,1", "1714730400000000000 is not a time in microseconds"),
     ],
 )
 def test_bad_tables(tmp_path: Path, line: int, new: str, message: str) -> None:

@@ -86,6 +86,20 @@ def test_positions_become_gnss_with_their_accuracy(drive: Path, tmp_path: Path) 
     assert gnss.antenna_in_rig_m == [0, 0, 0]
 
 
+def test_positions_in_files_without_leading_zeros(drive: Path, tmp_path: Path) -> None:
+    """Frames 9 and 10 in the order of their numbers, not of their names."""
+    times = "".join(f"{stamp(25.9 + 0.1 * f)}\n" for f in range(11))
+    (drive / "oxts" / "timestamps.txt").write_text(times)
+    for frame, name in ((3, "9.txt"), (4, "10.txt")):
+        (drive / "oxts" / "data" / f"{frame:010d}.txt").rename(drive / "oxts" / "data" / name)
+    import_recording(drive, tmp_path / "drive")
+    gnss = read_drive(tmp_path / "drive").manifest.gnss
+    assert gnss is not None
+    times_us = [sample.timestamp_us for sample in gnss.samples]
+    assert times_us == sorted(times_us)
+    assert len(times_us) == FRAMES
+
+
 def test_truth_where_asked_for(drive: Path, tmp_path: Path) -> None:
     assert import_recording(drive, tmp_path / "drive", truth=True).truth
     truth = np.loadtxt(tmp_path / "drive" / "truth.tum")
@@ -118,6 +132,8 @@ def test_one_of_several_drives(drive: Path, tmp_path: Path) -> None:
     ("file", "content", "message"),
     [
         ("oxts/data/0000000001.txt", "1 2 3\n", "0000000001.txt, line 1: '1 2 3' is not 30 numbers"),
+        ("oxts/data/0000000001.txt", "\n", "0000000001.txt has no values"),
+        ("oxts/data/readme.txt", "units\n", "readme.txt is not named by a frame number"),
         ("oxts/data/0000000001.txt", f"{95.0} {'0 ' * 29}\n", "oxts .*, sample 1: latitude_deg 95"),
         ("oxts/timestamps.txt", f"{stamp(3)}\n", "timestamps.txt has 1 lines, but there is a file of frame 4"),
         ("image_01/timestamps.txt", "noon\n", "image_01/timestamps.txt, line 1: 'noon' is no date"),

@@ -252,6 +252,9 @@ def put(table: str, index: int, field: str, value: Any) -> Callable[[Tables], No
         (drop("calibrated_sensor", 2), "calibrated_sensor 'c-CAM_BACK'"),
         (put("sample", 3, "next", "scene-0061-0"), "sample"),  # runs in a circle
         (put("calibrated_sensor", 1, "camera_intrinsic", [[1.0]]), "no 3x3 camera_intrinsic"),
+        (put("calibrated_sensor", 1, "camera_intrinsic", [[40.0, 0.0], [1.0]]), "no 3x3 camera_intrinsic"),
+        (put("sample_data", 2, "timestamp", 10**20), "sample_data.json: 2.timestamp"),
+        (put("sample_data", 2, "timestamp", -1), "sample_data.json: 2.timestamp"),
         (
             put("calibrated_sensor", 1, "camera_intrinsic", [[40.0, 0.0, 0.0], [0.0, 40.0, 0.0], [23.5, 15.5, 1.0]]),
             "camera_intrinsic is no calibration matrix",
