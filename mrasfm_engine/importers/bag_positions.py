@@ -9,10 +9,9 @@ import numpy as np
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.bag_contents import BagContent, us_from_ns
-from mrasfm_engine.importers.recording import gnss_of_vehicle
+from mrasfm_engine.importers.recording import antenna_on_vehicle, gnss_of_vehicle
 from mrasfm_engine.types import Floats
 from schemas import Gnss
-from schemas.drive import MAX_RIG_EXTENT_M
 
 NO_FIX, UNKNOWN_COVARIANCE = -1, 0  # of NavSatFix
 VERTICAL_OVER_HORIZONTAL = 2.0  # where only one standard deviation is given
@@ -60,12 +59,7 @@ def gnss_of_bag(
         if antenna_m is None
         else np.array(antenna_m)
     )
-    if not np.isfinite(antenna).all() or np.abs(antenna).max() > MAX_RIG_EXTENT_M:
-        raise InputError(
-            f"the antenna is at {antenna.tolist()} m in the rig frame, over {MAX_RIG_EXTENT_M:g} m away",
-            remedy="Give metres with --antenna.",
-        )
-    return gnss.model_copy(update={"antenna_in_rig_m": [float(v) for v in antenna]}), notes
+    return gnss.model_copy(update={"antenna_in_rig_m": antenna_on_vehicle(antenna.tolist())}), notes
 
 
 def _antenna_m(content: BagContent, frame: str, rig_frame: str | None) -> Floats:

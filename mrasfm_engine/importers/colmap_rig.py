@@ -8,7 +8,7 @@ COLMAP knows no vehicle and no times.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated
@@ -19,7 +19,14 @@ from pydantic import BaseModel, ConfigDict, Field, RootModel
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.geotags import GeoTag, read_exif, read_geo_txt
-from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, choose_scene, gnss_of_vehicle
+from mrasfm_engine.importers.recording import (
+    Recording,
+    SourceImage,
+    SourceUnit,
+    antenna_on_vehicle,
+    choose_scene,
+    gnss_of_vehicle,
+)
 from mrasfm_engine.importers.rig_folder import checked_camera
 from mrasfm_engine.importers.skipped_images import is_image, notes_of_images_without_a_camera
 from mrasfm_engine.io.axes import flu_from_body
@@ -143,8 +150,20 @@ def _names(rig: _Rig, file: Path) -> list[str]:
 
 def _paths(root: Path) -> dict[str, Path]:
     """All images below a folder by their paths in it, without what macOS leaves beside them."""
-    images = {path.relative_to(root).as_posix(): path for path in sorted(root.rglob("*")) if is_image(path)}
+    images = {path.relative_to(root).as_posix(): path for path in sorted(_files_below(root)) if is_image(path)}
     return {name: path for name, path in images.items() if not is_ignored(name) and path.is_file()}
+
+
+def _files_below(folder: Path, above: frozenset[Path] = frozenset()) -> Iterator[Path]:
+    """All files below a folder, also in folders that are links, as to another disk; not in circles of them."""
+    resolved = folder.resolve()
+    if resolved in above:
+        return
+    for path in folder.iterdir():
+        if path.is_dir():
+            yield from _files_below(path, above | {resolved})
+        else:
+            yield path
 
 
 def _images(
@@ -273,12 +292,12 @@ def _positions(folder: Path, frames: list[dict[str, Path]], exif: dict[Path, Geo
     file = next((f for f in (folder / POSITIONS, folder / "images" / POSITIONS) if f.is_file()), None)
     if file is None:
         return [next((tag for path in frame.values() if (tag := exif[path]) is not None), None) for frame in frames]
-    rows, root = read_geo_txt(file), folder.resolve()
+    rows = read_geo_txt(file)
     found, used = [], set()
     for frame in frames:
         of_frame = None
         for path in frame.values():
-            relative = path.resolve().relative_to(root).as_posix()
+            relative = path.relative_to(folder).as_posix()
             for key in (relative, relative.removeprefix("images/"), path.name):
                 if key in rows:
                     used.add(key)
@@ -334,4 +353,4 @@ def _gnss(
     if antenna_m is None:
         notes.append("GNSS: the antenna is taken to be at the reference camera; --antenna gives another place.")
         return gnss, notes
-    return gnss.model_copy(update={"antenna_in_rig_m": [float(v) for v in antenna_m]}), notes
+    return gnss.model_copy(update={"antenna_in_rig_m": antenna_on_vehicle(antenna_m)}), notes

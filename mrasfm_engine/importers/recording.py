@@ -15,6 +15,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.types import Floats, Ints
 from schemas import BodyAxes, Camera, Gnss, GnssSample, LabelMap
+from schemas.drive import MAX_RIG_EXTENT_M
 
 # Calibrations made with OpenCV's tools put the origin at the centre of the top left pixel; manifests, as COLMAP, at its
 # corner. The principal point moves by this, focal length and distortion are the same in both.
@@ -209,6 +210,24 @@ def gnss_of_vehicle(
                 code="bad-gnss-file",
             ) from None
     return Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[0.0, 0.0, 0.0], samples=samples)
+
+
+def antenna_on_vehicle(antenna_m: Sequence[float]) -> list[float]:
+    """The antenna's position (3,) in the rig frame as a manifest may have it.
+
+    Raises
+    ------
+    InputError
+        If it is not on the vehicle.
+    """
+    antenna = [float(value) for value in antenna_m]
+    if not all(abs(value) <= MAX_RIG_EXTENT_M for value in antenna):  # also refuses NaN
+        raise InputError(
+            f"the antenna is at {antenna} m in the rig frame, over {MAX_RIG_EXTENT_M:g} m away",
+            remedy="Give metres with --antenna.",
+            code="bad-antenna",
+        )
+    return antenna
 
 
 def parse_slice(text: str) -> slice:

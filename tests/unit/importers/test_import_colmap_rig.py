@@ -303,6 +303,29 @@ def test_positions_of_images_that_are_not_there(rig: Path, tmp_path: Path) -> No
         import_recording(rig, tmp_path / "drive", options={"rate_hz": 10.0, "gnss_sigma_m": 1.0})
 
 
+def test_images_in_folders_that_are_links(rig: Path, tmp_path: Path) -> None:
+    """All images on another disk, and a camera's own folder there; a link back to the images is no circle."""
+    write_images(rig)
+    (rig / "images").rename(tmp_path / "disk")
+    (tmp_path / "disk" / "rig1" / "left").rename(tmp_path / "left")
+    (tmp_path / "disk" / "rig1" / "left").symlink_to(tmp_path / "left")
+    (rig / "images").symlink_to(tmp_path / "disk")
+    (tmp_path / "left" / "back").symlink_to(tmp_path / "disk")
+    rows = [(f"rig1/front/image{f}.jpg", *place(f)[1::-1], f"{place(f)[2]} 0 0 0 1 2") for f in range(FRAMES)]
+    (rig / "geo.txt").write_text(geo_txt("EPSG:4326", rows))
+    summary = import_recording(rig, tmp_path / "drive", options={"rate_hz": 10.0})
+    assert (summary.images, summary.gnss_samples) == (2 * FRAMES, FRAMES)
+    assert not any("image_prefix" in note for note in summary.notes)
+
+
+def test_an_antenna_that_is_not_on_the_vehicle(rig: Path, tmp_path: Path) -> None:
+    write_images(rig, geotagged)
+    with pytest.raises(InputError, match=r"antenna is at \[0\.0, 0\.0, 1800\.0\] m .* over 100 m away") as caught:
+        import_recording(rig, tmp_path / "drive", options={"antenna_m": [0.0, 0.0, 1800.0]})
+    assert "--antenna" in caught.value.remedy
+    assert not (tmp_path / "drive").exists()
+
+
 def test_times_with_an_offset(rig: Path, tmp_path: Path) -> None:
     write_images(rig, lambda f: exif_of(time=f"2026:03:04 12:11:{12 + f:02d}", subsecond="25", offset="+02:00"))
     import_recording(rig, tmp_path / "drive")
