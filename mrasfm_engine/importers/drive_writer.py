@@ -199,7 +199,8 @@ def _manifest(recording: Recording) -> DriveManifest:
         what = ": ".join([*map(str, first["loc"]), str(first["msg"]).removeprefix("Value error, ")])
         if isinstance(first["input"], int | float):
             what = f"{what} (is {first['input']})"
-        raise InputError(f"recording {recording.name}: {what}", remedy="Correct it at its source.") from None
+        remedy = "Give a name with --name." if first["loc"] == ("name",) else "Correct it at its source."
+        raise InputError(f"recording {recording.name}: {what}", remedy=remedy) from None
     for problem in file_problems(manifest):
         what = f"the drive's file {problem.path} {problem.what}"
         raise InputError(f"recording {recording.name}: {what}", remedy="Rename its camera at its source.")
@@ -234,9 +235,9 @@ def _frame_image(camera: str, frame: int, image: SourceImage) -> FrameImage:
 
 
 def _place(source: Path, target: Path, *, copy: bool) -> None:
-    source = source.resolve()  # a link to a symbolic link would not be self-contained
-    if not source.is_file():
+    if not source.is_file():  # also a link that leads nowhere, or in a circle
         raise InputError(f"{source} does not exist or is not a file", remedy="Restore it.", code="missing-file")
+    source = source.resolve()  # a link to a symbolic link would not be self-contained
     if not copy:
         try:
             os.link(source, target)

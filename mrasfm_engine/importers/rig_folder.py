@@ -19,7 +19,7 @@ from mrasfm_engine.importers.recording import (
     pinhole_params,
     proper_transform,
 )
-from mrasfm_engine.importers.skipped_images import is_image, unread_files
+from mrasfm_engine.importers.skipped_images import is_image, notes_of_masks_without_a_frame, unread_files
 from mrasfm_engine.importers.tables import read_poses, read_times
 from mrasfm_engine.importers.unknown_fields import notes_of_unknown_fields
 from mrasfm_engine.io.axes import flu_from_body
@@ -137,7 +137,10 @@ def read(folder: Path) -> Recording:
         vehicle=rig.vehicle,
         default_gnss=gnss if gnss.exists() else None,
         label_map=LabelMap.cityscapes() if any(masks.values()) else None,
-        notes=rig.notes(folder / "rig.json"),
+        notes=[
+            *rig.notes(folder / "rig.json"),
+            *notes_of_masks_without_a_frame({name: sorted(own.keys() - {*frames}) for name, own in masks.items()}),
+        ],
         unread_files={at: unread_files(folder / at) for name in rig.cameras for at in (name, f"semantics/{name}")},
     )
 

@@ -55,6 +55,22 @@ def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit])
     return [f"Frames without an image of a camera: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
 
 
+def notes_of_masks_without_a_frame(numbers: Mapping[str, Sequence[int]]) -> list[str]:
+    """A note that counts and names masks of frames of which there is no image at all; none where there are none.
+
+    Parameters
+    ----------
+    numbers
+        Numbers of such frames by camera.
+    """
+    parts = [
+        f"{_short(camera)}: {len(own)} ({listed([*map(str, own)], MAX_NAMES)})"
+        for camera, own in numbers.items()
+        if own
+    ]
+    return [f"Masks of frames that have no images, left out: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
+
+
 def notes_of_images_without_a_camera(paths: Sequence[str]) -> list[str]:
     """A note that counts and names the images that begin with no camera's prefix; none where there are none."""
     names = listed([*map(_short, paths)], MAX_NAMES)

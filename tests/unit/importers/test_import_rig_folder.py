@@ -97,6 +97,14 @@ def test_a_piece_of_a_recording_has_a_name_of_its_own(recording: Path, tmp_path:
         assert (error.what, error.code) == (f"--name {name!r} is no name of a drive", "bad-drive-name")
 
 
+def test_a_folder_whose_name_no_drive_has(recording: Path, tmp_path: Path) -> None:
+    folder = recording.rename(tmp_path / ("street" * 40))
+    error = refused(folder, tmp_path / "drive")
+    assert "name: String should have at most 200 characters" in error.what
+    assert "--name" in error.remedy
+    assert import_recording(folder, tmp_path / "drive", name="street").units == 8
+
+
 def test_cameras_whose_folders_are_one_on_many_systems(recording: Path, tmp_path: Path) -> None:
     def rename(document: dict[str, Any]) -> None:
         document["cameras"]["CAM_L"] = document["cameras"].pop("cam_r")
@@ -170,6 +178,17 @@ def test_symbolic_links_become_files(recording: Path, tmp_path: Path) -> None:
     import_recording(recording, tmp_path / "drive")
     assert not [path for path in (tmp_path / "drive").rglob("*") if path.is_symlink()]
     assert check_drive(read_drive(tmp_path / "drive")) == []
+
+
+@pytest.mark.parametrize("target", ["000003.png", "/nowhere/000003.png"])
+def test_a_link_that_leads_nowhere_is_named(recording: Path, tmp_path: Path, target: str) -> None:
+    """One in a circle, and one to a file that is gone."""
+    file = recording / "cam_l" / "000003.png"
+    file.unlink()
+    file.symlink_to(target)
+    error = refused(recording, tmp_path / "drive")
+    assert error.what.startswith(f"{file} does not exist")
+    assert error.code == "missing-file"
 
 
 @pytest.mark.parametrize(
@@ -406,6 +425,17 @@ def test_missing_images_and_masks_are_allowed(recording: Path, tmp_path: Path) -
     (recording / "semantics/cam_r/000003.png").unlink()
     summary = import_recording(recording, tmp_path / "drive")
     assert (summary.units, summary.images, summary.masks) == (8, 15, 14)
+
+
+def test_masks_without_a_frame_are_noted(recording: Path, tmp_path: Path) -> None:
+    """Masks that count from 1, where images count from 0."""
+    masks = recording / "semantics" / "cam_r"
+    for number in reversed(range(8)):
+        (masks / f"{number:06d}.png").rename(masks / f"{number + 1:06d}.png")
+    shutil.copy(masks / "000001.png", masks / "000009.png")
+    summary = import_recording(recording, tmp_path / "drive")
+    assert summary.masks == 15
+    assert summary.notes == ["Masks of frames that have no images, left out: cam_r: 2 (8, 9)."]
 
 
 def test_images_that_an_import_loses_are_noted(recording: Path, tmp_path: Path) -> None:
