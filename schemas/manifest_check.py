@@ -21,9 +21,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import LONGEST_VEHICLE_M, SIGMA_TRANSLATION_M, BodyAxes, Camera, DriveManifest, Pose
+from schemas.drive import (
+    LONGEST_VEHICLE_M,
+    SIGMA_TRANSLATION_M,
+    BodyAxes,
+    Camera,
+    DriveManifest,
+    Pose,
+    RoughTrajectory,
+)
 from schemas.findings import Finding, Severity, as_json, error, listed, warning
-from schemas.gnss_check import check_gnss
+from schemas.gnss_check import JUMP_SIGMAS, MAX_SPEED_MPS, check_gnss
 from schemas.parsing import DocumentError, parse_manifest
 
 MAX_UNSYNCHRONISED_US = 60_000  # nuScenes' cameras are up to 50 ms apart
@@ -32,6 +40,7 @@ MAX_FRAME_INTERVAL_US = 20_000_000
 USUAL_INTERVAL_US = 100_000
 OTHER_UNITS_US = {"nanoseconds": 1e-3, "milliseconds": 1e3, "seconds": 1e6}
 MAX_CAMERA_ROLL_DEG = 60.0
+MAX_VEHICLE_TILT_DEG = 60.0  # no road is steeper than 20
 LEVEL_DEG = 45.0  # half of what tells one axis from another
 
 _UP_IN_BODY = {BodyAxes.FLU: (0, 0, 1), BodyAxes.RDF: (0, -1, 0), BodyAxes.FRD: (0, 0, -1)}
@@ -313,6 +322,8 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
                 "Sort the rough poses by time and give every one its own timestamp.",
             )
         ]
+    if findings := _check_rough_world(recorded.manifest, rough, times):
+        return findings
     units = recorded.timestamps_us
     covered = (units >= times[0] - MAX_UNSYNCHRONISED_US) & (units <= times[-1] + MAX_UNSYNCHRONISED_US)
     if not covered.any():
@@ -328,6 +339,38 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
         what = f"{int((~covered).sum())} of {len(units)} frames are outside the rough poses' time"
         return [warning("rough-poses-partial", what, "Give rough poses of the drive's whole time.")]
     return []
+
+
+def _check_rough_world(manifest: DriveManifest, rough: RoughTrajectory, times_us: NDArray[np.int64]) -> list[Finding]:
+    """Find rough poses in a world that is not in metres, or whose z axis does not point up."""
+    positions_m = np.array([pose.world_from_rig.translation_m for pose in rough.poses])
+    steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+    excess_m = steps_m - JUMP_SIGMAS * math.sqrt(2.0) * rough.sigma_translation_m
+    steps_s = np.diff(times_us) / 1e6
+    if len(steps_m) and np.median(excess_m - MAX_SPEED_MPS * steps_s) > 0.0:
+        return [
+            error(
+                "rough-poses-speed",
+                f"rough_poses.poses are mostly further apart than a vehicle drives: {np.median(steps_m):.0f} m in "
+                f"{np.median(steps_s):g} s",
+                "Give the translation_m of world_from_rig in metres, not in centimetres or millimetres, and "
+                "timestamp_us in microseconds.",
+            )
+        ]
+    x, y, z, w = np.array([pose.world_from_rig.rotation_xyzw for pose in rough.poses]).T
+    axes_up = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
+    upright = axes_up @ np.array(_UP_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
+    if np.median(upright) > np.cos(np.radians(MAX_VEHICLE_TILT_DEG)):
+        return []
+    return [
+        error(
+            "rough-poses-world",
+            f"rough_poses.poses have the vehicle mostly turned by over {MAX_VEHICLE_TILT_DEG:g} degrees against the z "
+            "axis of their world",
+            "Give world_from_rig in a world whose z axis points up; check rig.body_axes, and that the quaternion ends "
+            "with w.",
+        )
+    ]
 
 
 def _image_axes(rig_from_cam: Pose) -> NDArray[np.float64]:

@@ -16,7 +16,8 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.geodesy import ecef_from_local, geodetic_from_local
 from mrasfm_engine.preflight.drive_reader import Finding, Severity, check_drive, read_drive, require_sound
-from mrasfm_engine.scene.drive import pose_from_matrix
+from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
+from schemas import Pose
 from schemas.findings import as_json
 
 WriteDrive = Callable[[dict[str, Any]], Path]
@@ -332,6 +333,40 @@ def test_rough_poses_in_time(drive_document: Document, write_drive: WriteDrive) 
     only(write_drive(drive_document), "rough-poses-order", Severity.ERROR)
     drive_document["rough_poses"]["poses"] = [poses[0] | {"timestamp_us": 90_000_000}]
     only(write_drive(drive_document), "rough-poses-not-covering", Severity.ERROR)
+
+
+def test_rough_poses_in_centimetres(drive_document: Document, write_drive: WriteDrive) -> None:
+    """Faster than any vehicle, unless that is within the noise that they state."""
+    drive_document["rough_poses"] = rough_poses([(0.0, 10.0 * i) for i in range(5)])  # 100 m/s
+    assert findings(write_drive(drive_document)) == {}
+    drive_document["rough_poses"] = rough_poses([(0.0, 200.0 * i) for i in range(5)])
+    finding = only(write_drive(drive_document), "rough-poses-speed", Severity.ERROR)
+    assert "200 m in 0.1 s" in finding.what
+    assert "centimetres" in finding.remedy
+    drive_document["rough_poses"]["sigma_translation_m"] = 50.0
+    assert findings(write_drive(drive_document)) == {}
+
+
+@pytest.mark.parametrize("axes", ["flu", "frd"])
+def test_rough_poses_in_a_world_with_z_down(drive_document: Document, write_drive: WriteDrive, axes: str) -> None:
+    """North, east, down; a vehicle of axes forward, right, down lies level in it, and is upside down for us."""
+    drive_document["rough_poses"] = rough_poses([(float(i), 0.0) for i in range(5)])
+    over = [1.0, 0.0, 0.0, 0.0]  # about x: z points down
+    drive_document["rig"]["body_axes"] = axes
+    if axes == "frd":
+        turn = se3.transform(np.diag([1.0, -1.0, -1.0]), np.zeros(3))
+        for camera in drive_document["rig"]["cameras"]:
+            pose = matrix_from_pose(Pose(**camera["rig_from_cam"]))
+            camera["rig_from_cam"] = pose_from_matrix(turn @ pose).model_dump()
+        drive_document["gnss"]["antenna_in_rig_m"] = [0.0, 0.0, -1.8]
+    else:
+        for pose in drive_document["rough_poses"]["poses"]:
+            pose["world_from_rig"]["rotation_xyzw"] = over
+    finding = only(write_drive(drive_document), "rough-poses-world", Severity.ERROR)
+    assert "z axis points up" in finding.remedy
+    for pose in drive_document["rough_poses"]["poses"]:
+        pose["world_from_rig"]["rotation_xyzw"] = over if axes == "frd" else [0.0, 0.0, 0.0, 1.0]
+    assert findings(write_drive(drive_document)) == {}
 
 
 def test_wrong_axes_of_the_whole_rig(drive_document: Document, write_drive: WriteDrive) -> None:
