@@ -121,7 +121,9 @@ def read_mask(path: Path, label_map: LabelMap | None = None) -> Bytes:
     check_mask_header(header, path)
     mask = _to_8_bits(decode_png(data, cv2.IMREAD_UNCHANGED, header, path))
     ids = (LabelMap.cityscapes() if label_map is None else label_map).ids
-    unknown = [i for i in np.flatnonzero(np.bincount(mask.ravel(), minlength=256)) if int(i) not in ids]
+    # numpy's bincount would take eight bytes a pixel, and several masks are read at once.
+    counts = cv2.calcHist([mask], [0], None, [256], [0.0, 256.0])
+    unknown = [i for i in np.flatnonzero(counts) if int(i) not in ids]
     if unknown:
         raise InputError(
             f"mask {path} holds ids that the label map does not have: {', '.join(str(i) for i in unknown[:10])}",

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -209,6 +210,19 @@ def test_mask_ids(tmp_path: Path) -> None:
     cv2.imwrite(str(file), mask)
     with pytest.raises(InputError, match="does not have: 20"):
         read_mask(file)
+
+
+def test_the_check_of_a_mask_takes_little_memory(tmp_path: Path) -> None:
+    """A mask of 200 megapixels has 200 kB as a file, and several are read at once."""
+    file, pixels = tmp_path / "m.png", 2_000_000
+    cv2.imwrite(str(file), np.full((1000, pixels // 1000), 7, np.uint8))
+    read_mask(file)
+    tracemalloc.start()
+    try:
+        read_mask(file)
+        assert tracemalloc.get_traced_memory()[1] < 3 * pixels
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
