@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import atexit
+import errno
 import gc
 import json
 import os
@@ -24,6 +25,8 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141  # as of a program that a broken pipe ends
 EXIT_TERMINATED = 143  # as of a program that SIGTERM ends
+# Of the system's errors, those of the paths that a user gives or of what lies there.
+PATH_ERRORS = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.EIO})
 GROUP = "mrasfm.commands"
 INDEX = Path(__file__).with_name("command_index.json")  # what each subcommand does, by its name
 DESCRIPTION = "Multi-camera drives to metric maps."
@@ -110,6 +113,12 @@ def main(argv: list[str] | None = None) -> int:
         return EXIT_TERMINATED if isinstance(error, TerminatedError) else EXIT_INTERRUPTED
     except MrasfmError as error:
         print(f"mrasfm: error: {_without_control(str(error))}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except OSError as error:
+        if error.errno not in PATH_ERRORS or error.filename is None:
+            raise
+        print(f"mrasfm: error: {_without_control(f'{error.filename}: {error.strerror}')}", file=sys.stderr)
+        print("  Check the path and its permissions.", file=sys.stderr)
         return EXIT_BAD_INPUT
     except KeyboardInterrupt:
         print("mrasfm: interrupted", file=sys.stderr)

@@ -139,6 +139,26 @@ def test_a_file_whose_name_a_terminal_would_obey_is_named(tmp_path: Path, capsys
     assert said.replace("\n", "").isprintable()
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("preflight", "PATH"),
+        ("import", "PATH", "--out", "drive"),
+        ("export", "scene", "--format", "kitti", "--out", "PATH"),
+        ("export", "PATH", "--format", "kitti", "--out", "export"),
+    ],
+)
+def test_a_path_that_no_system_has_is_named(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = "a" * 300
+    assert main([path if word == "PATH" else word for word in words]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith(f"mrasfm: error: {path}")
+    assert message.endswith(": File name too long\n  Check the path and its permissions.\n")
+
+
 def test_bash_completes_commands_and_options() -> None:
     script = FOLDER / "mrasfm.bash"
 
