@@ -15,6 +15,7 @@ from mrasfm_engine.importers.recording import proper_transform
 from mrasfm_engine.types import Floats
 
 MAX_BYTES = 20_000_000_000  # images of a segment of Waymo are 1 to 2 GB, and are read row by row
+MAX_INTEGER = 2**62  # with room to round in 64 bits; nanoseconds of the year 2116
 EXTRA = "av2"
 
 
@@ -84,8 +85,8 @@ class Columns:
             If it is missing or holds something else.
         """
         values = self._values(name)
-        if not all(isinstance(value, int) for value in values):
-            raise self._defect(name, "holds a value that is no integer")
+        if not all(isinstance(value, int) and abs(value) <= MAX_INTEGER for value in values):
+            raise self._defect(name, f"holds a value that is no integer up to {MAX_INTEGER}")
         return values
 
     def texts(self, name: str) -> list[str]:

@@ -102,6 +102,12 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     )
     of_camera = {camera: readouts_us[np.array(cameras) == camera] for camera in sorted(set(cameras))}
     rig = [_camera(camera, calibration, own) for camera, own in of_camera.items()]
+    if len({*zip(frames_us, cameras, strict=True)}) < len(frames_us):
+        raise InputError(
+            f"table {file} has several images of one camera at one {_TIME}",
+            remedy="Download it again.",
+            code="bad-table",
+        )
     units = _units(frames_us, cameras, times_us)
     truth = _truth(folder / POSES / file.name, images, np.array([unit.timestamp_us for unit in units]))
     is_unknown = any(camera.readout_us is None for camera in rig)

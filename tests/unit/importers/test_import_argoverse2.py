@@ -145,6 +145,11 @@ def _columns(file: Path) -> tuple[list[str], list[Any]]:
         ("calibration/egovehicle_SE3_sensor.feather", {"qw": [3.0, 1.0]}, "holds a quaternion that is not of norm 1"),
         ("calibration/egovehicle_SE3_sensor.feather", {"sensor_name": [1, 2]}, "holds a value that is no text"),
         ("city_SE3_egovehicle.feather", {"timestamp_ns": None}, "column timestamp_ns: is not there"),
+        (
+            "city_SE3_egovehicle.feather",
+            {"timestamp_ns": np.full(5 * FRAMES + 1, 2**63, np.uint64)},
+            "column timestamp_ns: holds a value that is no integer up",
+        ),
     ],
 )
 def test_malformed_tables_are_named(

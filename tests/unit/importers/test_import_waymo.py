@@ -140,6 +140,13 @@ def changed(folder: Path, kind: str, **columns: Any) -> None:
         ("camera_image", "shutter", None, r"rolling_shutter_params\.shutter: is not there"),
         ("camera_image", "camera_readout_done_time", lambda v: [v[0] + 0.01, *v[1:]], "camera front: images are read"),
         ("camera_image", "camera_name", lambda v: [9, *v[1:]], "camera 9 is not known"),
+        ("camera_image", "frame_timestamp_micros", lambda v: v[:1] * len(v), "several images of one camera at one"),
+        (
+            "vehicle_pose",
+            "frame_timestamp_micros",
+            lambda v: [2**63 - 1, *v[1:]],
+            "holds a value that is no integer up",
+        ),
         ("camera_image", ".image", lambda v: [b"none", *v[1:]], "is neither a JPEG nor a PNG"),
         (
             "camera_image",
