@@ -322,7 +322,7 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
                 "Sort the rough poses by time and give every one its own timestamp.",
             )
         ]
-    if findings := _check_rough_world(recorded.manifest, rough, times):
+    if findings := _check_rough_speed(rough, times):
         return findings
     units = recorded.timestamps_us
     covered = (units >= times[0] - MAX_UNSYNCHRONISED_US) & (units <= times[-1] + MAX_UNSYNCHRONISED_US)
@@ -335,38 +335,44 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
                 "Give rough poses of the drive's time, or leave them out.",
             )
         ]
+    found = _check_rough_world(recorded.manifest, rough)
     if not covered.all():
         what = f"{int((~covered).sum())} of {len(units)} frames are outside the rough poses' time"
-        return [warning("rough-poses-partial", what, "Give rough poses of the drive's whole time.")]
-    return []
+        found.append(warning("rough-poses-partial", what, "Give rough poses of the drive's whole time."))
+    return found
 
 
-def _check_rough_world(manifest: DriveManifest, rough: RoughTrajectory, times_us: NDArray[np.int64]) -> list[Finding]:
-    """Find rough poses in a world that is not in metres, or whose z axis does not point up."""
+def _check_rough_speed(rough: RoughTrajectory, times_us: NDArray[np.int64]) -> list[Finding]:
+    """Find rough poses that are not in metres."""
     positions_m = np.array([pose.world_from_rig.translation_m for pose in rough.poses])
     steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
     excess_m = steps_m - JUMP_SIGMAS * math.sqrt(2.0) * rough.sigma_translation_m
     steps_s = np.diff(times_us) / 1e6
-    if len(steps_m) and np.median(excess_m - MAX_SPEED_MPS * steps_s) > 0.0:
-        return [
-            error(
-                "rough-poses-speed",
-                f"rough_poses.poses are mostly further apart than a vehicle drives: {np.median(steps_m):.0f} m in "
-                f"{np.median(steps_s):g} s",
-                "Give the translation_m of world_from_rig in metres, not in centimetres or millimetres, and "
-                "timestamp_us in microseconds.",
-            )
-        ]
+    if not len(steps_m) or np.median(excess_m - MAX_SPEED_MPS * steps_s) <= 0.0:
+        return []
+    return [
+        error(
+            "rough-poses-speed",
+            f"rough_poses.poses are mostly further apart than a vehicle drives: {np.median(steps_m):.0f} m in "
+            f"{np.median(steps_s):g} s",
+            "Give the translation_m of world_from_rig in metres, not in centimetres or millimetres, and "
+            "timestamp_us in microseconds.",
+        )
+    ]
+
+
+def _check_rough_world(manifest: DriveManifest, rough: RoughTrajectory) -> list[Finding]:
+    """Find rough poses of a world whose z axis does not point up."""
     x, y, z, w = np.array([pose.world_from_rig.rotation_xyzw for pose in rough.poses]).T
     axes_up = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1)
     upright = axes_up @ np.array(_UP_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
     if np.median(upright) > np.cos(np.radians(MAX_VEHICLE_TILT_DEG)):
         return []
     return [
-        error(
+        warning(
             "rough-poses-world",
             f"rough_poses.poses have the vehicle mostly turned by over {MAX_VEHICLE_TILT_DEG:g} degrees against the z "
-            "axis of their world",
+            "axis of their world: the scene lies as they do, and its pictures take that axis for up",
             "Give world_from_rig in a world whose z axis points up; check rig.body_axes, and that the quaternion ends "
             "with w.",
         )
