@@ -15,6 +15,7 @@ JUMP_SIGMAS = 4.0
 # Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
 EXTRAPOLATED_SAMPLES = 1.5
 MAX_EXTRAPOLATION_US = 2_000_000
+SEA_DEG = (np.pi / 2, np.pi)  # latitude and longitude off 0, 0 up to which there is no land; all radians are there
 WGS84_A_M, WGS84_E2 = 6_378_137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
 
 Ints = NDArray[np.int64]
@@ -41,7 +42,12 @@ def check_gnss(manifest: DriveManifest, image_times_us: NDArray[np.int64]) -> li
     findings = _check_order(times)
     if findings:
         return findings  # the rest assumes an order
-    return [*_check_cover(image_times_us, times), *_check_jumps(gnss, times), *_check_swapped(manifest, times)]
+    return [
+        *_check_land(gnss),
+        *_check_cover(image_times_us, times),
+        *_check_jumps(gnss, times),
+        *_check_swapped(manifest, times),
+    ]
 
 
 def _check_order(times: Ints) -> list[Finding]:
@@ -67,6 +73,21 @@ def _check_order(times: Ints) -> list[Finding]:
             )
         )
     return findings
+
+
+def _check_land(gnss: Gnss) -> list[Finding]:
+    """Find positions in radians, and those of a receiver without a fix that gives zeros."""
+    degrees = np.array([(sample.latitude_deg, sample.longitude_deg) for sample in gnss.samples])
+    at_sea = (np.abs(degrees) <= SEA_DEG).all(axis=1)
+    if not at_sea.any():
+        return []
+    return [
+        warning(
+            "gnss-at-sea",
+            f"{int(at_sea.sum())} of {len(degrees)} gnss.samples lie in the sea around latitude 0, longitude 0",
+            "Give latitude_deg and longitude_deg in degrees, not in radians, and leave out samples without a fix.",
+        )
+    ]
 
 
 def _covered(images: Ints, samples: Ints) -> Bools:

@@ -323,6 +323,18 @@ def rough_poses(track: list[tuple[float, float]]) -> Document:
     }
 
 
+@pytest.mark.parametrize("in_radians", [True, False])
+def test_positions_where_there_is_no_land(drive_document: Document, write_drive: WriteDrive, in_radians: bool) -> None:
+    samples = drive_document["gnss"]["samples"]
+    wrong = samples if in_radians else samples[:2]  # a receiver that gives zeros until it has a fix
+    for sample in wrong:
+        for name in ("latitude_deg", "longitude_deg"):
+            sample[name] = np.radians(sample[name]).item() if in_radians else 0.0
+    (finding,) = findings(write_drive(drive_document))["gnss-at-sea"]
+    assert finding.severity is Severity.WARNING
+    assert finding.what.startswith(f"{len(wrong)} of {len(samples)} gnss.samples lie in the sea")
+
+
 def test_rough_poses_in_time(drive_document: Document, write_drive: WriteDrive) -> None:
     drive_document["rough_poses"] = rough_poses([(0.0, float(i)) for i in range(5)])
     poses = drive_document["rough_poses"]["poses"]
