@@ -18,7 +18,7 @@ from mrasfm_engine.importers.arrow_tables import Columns, read_feather
 from mrasfm_engine.importers.frame_grouping import units_by_time
 from mrasfm_engine.importers.recording import Recording, SourceImage, choose_scene, interpolated_poses, with_truth
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
-from mrasfm_engine.importers.skipped_images import unread_files
+from mrasfm_engine.importers.skipped_images import notes_of_empty_cameras, unread_files
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera
 from schemas.drive import MAX_CAMERAS
@@ -61,12 +61,12 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         If the log is not there, a file is missing or malformed, or pyarrow is not installed.
     """
     log = choose_scene(_logs(folder), scene, folder).resolve()
-    images = {
+    every = {
         path.name: numbered_images(path, digits=TIME_DIGITS)
         for path in sorted((log / "sensors" / "cameras").iterdir())
         if path.is_dir()
     }
-    images = {name: files for name, files in images.items() if files}
+    images = {name: files for name, files in every.items() if files}
     if not 1 <= len(images) <= MAX_CAMERAS:
         raise InputError(
             f"{log / 'sensors' / 'cameras'} has images of {len(images)} cameras",
@@ -93,8 +93,8 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         cameras=cameras,
         units=with_truth(units, truth),
         common_world=None if city is None else f"av2-{city}",
-        notes=[*NOTES],
-        unread_files={name: unread_files(log / "sensors" / "cameras" / name) for name in images},
+        notes=[*NOTES, *notes_of_empty_cameras(every)],
+        unread_files={name: unread_files(log / "sensors" / "cameras" / name) for name in every},
     )
 
 

@@ -15,7 +15,7 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.recording import Recording, SourceImage, SourceUnit, pose_of_projection
 from mrasfm_engine.importers.rig_folder import frame_times, numbered_images, pinhole_camera, read_upright_poses
-from mrasfm_engine.importers.skipped_images import unread_files
+from mrasfm_engine.importers.skipped_images import notes_of_empty_cameras, unread_files
 from mrasfm_engine.importers.tables import read_lines
 from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.types import Floats
@@ -40,8 +40,8 @@ def read(folder: Path) -> Recording:
         If a file is missing or malformed.
     """
     names = [name for name in CAMERAS if (folder / name).is_dir()]
-    images = {name: numbered_images(folder / name) for name in names}
-    images = {name: files for name, files in images.items() if files}
+    every = {name: numbered_images(folder / name) for name in names}
+    images = {name: files for name, files in every.items() if files}
     frames = sorted({frame for files in images.values() for frame in files})
     if not frames:
         raise InputError(f"recording {folder} has no images in {', '.join(names)}", remedy="Unpack the images.")
@@ -65,6 +65,7 @@ def read(folder: Path) -> Recording:
         cameras=cameras,
         units=units,
         body_axes=BodyAxes.RDF,
+        notes=notes_of_empty_cameras(every),
         unread_files={name: unread_files(folder / name) for name in names},
     )
 

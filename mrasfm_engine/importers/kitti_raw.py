@@ -26,7 +26,7 @@ from mrasfm_engine.importers.recording import (
     proper_transform,
 )
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
-from mrasfm_engine.importers.skipped_images import unread_files
+from mrasfm_engine.importers.skipped_images import notes_of_empty_cameras, unread_files
 from mrasfm_engine.importers.tables import read_lines, read_numbers
 from mrasfm_engine.types import Floats, Ints
 from schemas import Camera, Gnss
@@ -78,8 +78,8 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     """
     drive = choose_scene(_drives(folder), scene, folder).resolve()
     day = drive.parent
-    images = {camera: numbered_images(drive / camera / "data") for camera in CAMERAS if (drive / camera).is_dir()}
-    images = {camera: files for camera, files in images.items() if files}
+    every = {camera: numbered_images(drive / camera / "data") for camera in CAMERAS if (drive / camera).is_dir()}
+    images = {camera: files for camera, files in every.items() if files}
     frames = sorted({frame for files in images.values() for frame in files})
     if not frames:
         raise InputError(f"recording {drive} has no images", remedy="Unpack the images.", code="no-images")
@@ -109,7 +109,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         ],
         gnss=gnss,
         truth_is_gnss=True,
-        notes=[*NOTES],
+        notes=[*NOTES, *notes_of_empty_cameras(every)],
         unread_files={camera: unread_files(drive / camera / "data") for camera in CAMERAS},
     )
 

@@ -55,6 +55,12 @@ def notes_of_missing_images(cameras: Iterable[str], units: Sequence[SourceUnit])
     return [f"Frames without an image of a camera: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
 
 
+def notes_of_empty_cameras(images: Mapping[str, Mapping[int, Path]]) -> list[str]:
+    """A note that names the cameras in whose folders, by name, no image is; none where there is no such folder."""
+    empty = [_short(camera) for camera, files in images.items() if not files]
+    return [f"Cameras without any image, left out: {enumerated(empty, MAX_FOLDERS)}."] if empty else []
+
+
 def notes_of_masks_without_a_frame(numbers: Mapping[str, Sequence[int]]) -> list[str]:
     """A note that counts and names masks of frames of which there is no image at all; none where there are none.
 

@@ -96,6 +96,15 @@ def test_log(log: Path, tmp_path: Path, given: str) -> None:
     assert any("not applied" in note for note in summary.notes)
 
 
+def test_a_camera_whose_images_are_of_another_format_is_noted(log: Path, tmp_path: Path) -> None:
+    folder = log / "sensors" / "cameras" / "stereo_front_left"
+    folder.mkdir()
+    (folder / f"{START_US * 1000}.webp").touch()
+    notes = import_recording(log, tmp_path / "drive").notes
+    assert "Cameras without any image, left out: stereo_front_left." in notes
+    assert any("stereo_front_left: 1" in note for note in notes)
+
+
 def test_poses_with_noise_become_rough_ones_in_the_city(log: Path, tmp_path: Path) -> None:
     quality = RoughQuality(sigma_m=0.5, sigma_deg=2.0)
     assert import_recording(log, tmp_path / "drive", rough_noise=quality).rough_poses == FRAMES

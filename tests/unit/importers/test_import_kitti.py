@@ -73,6 +73,7 @@ def test_one_camera_without_times_and_truth(sequence: Path, tmp_path: Path) -> N
     (tmp_path / "dataset/poses/04.txt").unlink()
     summary = import_recording(sequence, tmp_path / "drive")
     assert (summary.cameras, summary.truth) == (1, False)
+    assert "Cameras without any image, left out: image_3." in summary.notes
     assert not (tmp_path / "drive/truth.tum").exists()
     assert read_drive(tmp_path / "drive").timestamps_us.tolist() == [0, 100000, 200000, 300000, 400000]
 

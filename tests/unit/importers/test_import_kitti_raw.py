@@ -86,6 +86,11 @@ def test_positions_become_gnss_with_their_accuracy(drive: Path, tmp_path: Path) 
     assert gnss.antenna_in_rig_m == [0, 0, 0]
 
 
+def test_a_camera_without_images_is_noted(drive: Path, tmp_path: Path) -> None:
+    (drive / "image_02" / "data").mkdir(parents=True)
+    assert "Cameras without any image, left out: image_02." in import_recording(drive, tmp_path / "drive").notes
+
+
 def test_positions_in_files_without_leading_zeros(drive: Path, tmp_path: Path) -> None:
     """Frames 9 and 10 in the order of their numbers, not of their names."""
     times = "".join(f"{stamp(25.9 + 0.1 * f)}\n" for f in range(11))
