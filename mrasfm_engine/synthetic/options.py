@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, NoReturn
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.synthetic.rigs import MAX_SYNTHETIC_CAMERAS, mounts
 
 MIN_LOOP_M = 110.0
 LOOP_OVERLAP_M = 10.0
+MIN_SIDE_PX, MAX_SIDE_PX = 32, 8192  # of an image
+TEXTURES_PX = (64, 128, 256, 512, 1024)
+NOT_NEGATIVE = (
+    "seed", "parked_cars", "moving_cars", "same_way_cars", "moving_shadows", "exposure_jitter", "noise", "blur_px",
+    "standing_units", "time_skew_ms", "readout_ms", "gnss_noise_m", "gnss_drift_m", "gnss_bias_m", "biased_by_m",
+    "rough_noise_m", "rough_noise_deg", "perturb_rotation_deg", "perturb_translation_m",
+)  # fmt: skip
+FRACTIONS = ("drop_images", "gnss_outliers", "shadow_strength")
+OTHER_FLAGS = {"standing_units": "standing", "shadow_strength": "shadows"}  # of options that do not have their names
 
 
 class World(StrEnum):
@@ -90,78 +100,71 @@ class SynthOptions:
     miscalibrated_by_deg: float = 3.0  # additional rotation of the wrong camera about a random axis
 
     def __post_init__(self) -> None:
-        def refuse(what: str, remedy: str) -> None:
-            raise InputError(what, remedy=remedy)
+        self._check_counts_and_sizes()
+        self._check_amounts()
+        self._check_times_and_ways()
+        self._check_choices()
 
+    def _check_counts_and_sizes(self) -> None:
         if not 1 <= self.cameras <= MAX_SYNTHETIC_CAMERAS:
-            refuse(f"--cameras {self.cameras} is not possible", f"Ask for 1 to {MAX_SYNTHETIC_CAMERAS}.")
+            _refuse(f"--cameras {self.cameras} is not possible", f"Ask for 1 to {MAX_SYNTHETIC_CAMERAS}.")
         for name in ("units", "drives"):
             if getattr(self, name) < 1:
-                refuse(f"--{name} {getattr(self, name)} is not positive", "Ask for at least 1.")
-        if self.width < 32 or self.height < 32 or self.width > 8192 or self.height > 8192:
-            refuse(f"images of {self.width}x{self.height} pixels cannot be rendered", "Use sides of 32 to 8192 pixels.")
-        if self.texture_px not in (64, 128, 256, 512, 1024):
-            refuse(f"textures of {self.texture_px} pixels are not possible", "Use 64, 128, 256, 512 or 1024.")
-        for name in [
-            "parked_cars",
-            "moving_cars",
-            "same_way_cars",
-            "moving_shadows",
-            "exposure_jitter",
-            "noise",
-            "blur_px",
-            "standing_units",
-            "time_skew_ms",
-            "readout_ms",
-            "gnss_noise_m",
-            "gnss_drift_m",
-            "gnss_bias_m",
-            "biased_by_m",
-            "rough_noise_m",
-            "rough_noise_deg",
-            "perturb_rotation_deg",
-            "perturb_translation_m",
-            "seed",
-        ]:
-            if getattr(self, name) < 0:
-                flag = name.replace("_", "-")
-                refuse(f"--{flag} {getattr(self, name)} is negative", "Give zero or a positive number.")
-        for name in ("drop_images", "gnss_outliers", "shadow_strength"):
-            if not 0 <= getattr(self, name) <= 1:
-                flag = name.replace("_", "-")
-                refuse(f"--{flag} {getattr(self, name)} is not a fraction", "Give a number from 0 to 1.")
-        if not 1 <= self.rate_hz <= 100:
-            refuse(f"--rate-hz {self.rate_hz} is not a camera's", "Use 1 to 100.")
-        if not 0.05 <= self.spacing_m <= 5:
-            refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, at 10 Hz 0.5 to 50 m/s.")
-        between_ms = 1000 / self.rate_hz
-        if self.time_skew_ms >= between_ms:
-            refuse(f"--time-skew-ms {self.time_skew_ms} reaches the next unit", f"Use less than {between_ms:g} ms.")
-        if self.readout_ms >= between_ms:
-            refuse(f"--readout-ms {self.readout_ms} reaches the next unit", f"Use less than {between_ms:g} ms.")
-        if abs(self.ramp_percent) > 20:
-            refuse(f"--ramp {self.ramp_percent} is steeper than streets are", "Use -20 to 20 percent.")
+                _refuse(f"--{name} {getattr(self, name)} is not positive", "Ask for at least 1.")
+        if not all(MIN_SIDE_PX <= side <= MAX_SIDE_PX for side in (self.width, self.height)):
+            _refuse(
+                f"images of {self.width}x{self.height} pixels cannot be rendered",
+                f"Use sides of {MIN_SIDE_PX} to {MAX_SIDE_PX} pixels.",
+            )
+        if self.texture_px not in TEXTURES_PX:
+            _refuse(
+                f"textures of {self.texture_px} pixels are not possible",
+                f"Use one of {', '.join(map(str, TEXTURES_PX))}.",
+            )
         if self.standing_units > self.units // 2:
-            refuse(
+            _refuse(
                 f"--standing {self.standing_units} is more than half of {self.units} units", "Stand still for fewer."
             )
-        names = [mount.name for mount in mounts(self.cameras)]
-        for name in (*self.occluded_cameras, *([self.miscalibrated_camera] if self.miscalibrated_camera else [])):
-            if name not in names:
-                refuse(f"camera {name!r} is not on this vehicle", f"Its cameras are {', '.join(names)}.")
-        for name in ("biased_drive", "dusk_drive"):
-            drive = getattr(self, name)
-            if drive is not None and not 0 <= drive < self.drives:
-                flag = name.replace("_", "-")
-                refuse(f"--{flag} {drive} is none of the drives", f"Their numbers are 0 to {self.drives - 1}.")
-        if self.tight and (self.perturb_rotation_deg or self.perturb_translation_m):
-            refuse("--tight declares a calibration that is perturbed", "Leave out --tight, or the perturbation.")
+
+    def _check_amounts(self) -> None:
+        for name in NOT_NEGATIVE:
+            if not 0 <= getattr(self, name) < math.inf:
+                _refuse(f"{_flag(name)} {getattr(self, name)} is no amount", "Give zero or a positive number.")
+        for name in FRACTIONS:
+            if not 0 <= getattr(self, name) <= 1:
+                _refuse(f"{_flag(name)} {getattr(self, name)} is not a fraction", "Give a number from 0 to 1.")
+
+    def _check_times_and_ways(self) -> None:
+        if not 1 <= self.rate_hz <= 100:
+            _refuse(f"--rate-hz {self.rate_hz} is not a camera's", "Use 1 to 100.")
+        between_ms = 1000 / self.rate_hz
+        for name in ("time_skew_ms", "readout_ms"):
+            if getattr(self, name) >= between_ms:
+                _refuse(
+                    f"{_flag(name)} {getattr(self, name)} reaches the next unit", f"Use less than {between_ms:g} ms."
+                )
+        if not 0.05 <= self.spacing_m <= 5:
+            _refuse(f"--spacing-m {self.spacing_m} is not a car's", "Use 0.05 to 5 m, at 10 Hz 0.5 to 50 m/s.")
+        if not abs(self.ramp_percent) <= 20:
+            _refuse(f"--ramp {self.ramp_percent} is steeper than streets are", "Use -20 to 20 percent.")
         if self.world is World.LOOP and self.loop_length_m < MIN_LOOP_M:
             needed = int((MIN_LOOP_M / self.drives + LOOP_OVERLAP_M) / self.spacing_m) + 1
-            refuse(
+            _refuse(
                 f"{self.units} units of {self.spacing_m} m do not go around a block",
                 f"Ask for at least {needed} units.",
             )
+
+    def _check_choices(self) -> None:
+        names = [mount.name for mount in mounts(self.cameras)]
+        for name in (*self.occluded_cameras, *([self.miscalibrated_camera] if self.miscalibrated_camera else [])):
+            if name not in names:
+                _refuse(f"camera {name!r} is not on this vehicle", f"Its cameras are {', '.join(names)}.")
+        for name in ("biased_drive", "dusk_drive"):
+            drive = getattr(self, name)
+            if drive is not None and not 0 <= drive < self.drives:
+                _refuse(f"{_flag(name)} {drive} is none of the drives", f"Their numbers are 0 to {self.drives - 1}.")
+        if self.tight and (self.perturb_rotation_deg or self.perturb_translation_m):
+            _refuse("--tight declares a calibration that is perturbed", "Leave out --tight, or the perturbation.")
 
     @property
     def drive_length_m(self) -> float:
@@ -172,6 +175,15 @@ class SynthOptions:
     def loop_length_m(self) -> float:
         """Path around the block: every drive ends 10 m into the next one's path."""
         return self.drives * (self.drive_length_m - LOOP_OVERLAP_M)
+
+
+def _refuse(what: str, remedy: str) -> NoReturn:
+    raise InputError(what, remedy=remedy)
+
+
+def _flag(name: str) -> str:
+    """The option of `mrasfm synth` that sets it."""
+    return f"--{OTHER_FLAGS.get(name, name).replace('_', '-')}"
 
 
 def small_options(**changes: Any) -> SynthOptions:

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -385,12 +386,21 @@ def test_several_drives_share_one_world(tmp_path: Path) -> None:
         {"tight": True, "perturb_rotation_deg": 1.0},
         {"standing_units": 30},
         {"gnss_noise_m": -1.0},
+        {"gnss_noise_m": math.nan},
+        {"ramp_percent": math.nan},
+        {"dusk_drive": 1},
     ],
 )
 def test_nonsense_is_refused_with_a_remedy(changes: dict[str, object]) -> None:
     with pytest.raises(InputError) as caught:
         SynthOptions(**changes)
     assert caught.value.remedy
+
+
+@pytest.mark.parametrize(("name", "flag"), [("standing_units", "--standing"), ("shadow_strength", "--shadows")])
+def test_what_is_refused_is_named_as_the_command_has_it(name: str, flag: str) -> None:
+    with pytest.raises(InputError, match=f"^{flag} -1 "):
+        SynthOptions(**{name: -1})
 
 
 def test_command_line_reaches_the_options() -> None:
