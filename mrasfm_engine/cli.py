@@ -26,7 +26,7 @@ EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141  # as of a program that a broken pipe ends
 EXIT_TERMINATED = 143  # as of a program that SIGTERM ends
 # Of the system's errors, those of the paths that a user gives or of what lies there.
-PATH_ERRORS = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG, errno.EIO})
+PATH_ERRORS = frozenset({errno.EACCES, errno.EPERM, errno.ELOOP, errno.ENAMETOOLONG})
 GROUP = "mrasfm.commands"
 INDEX = Path(__file__).with_name("command_index.json")  # what each subcommand does, by its name
 DESCRIPTION = "Multi-camera drives to metric maps."
