@@ -103,6 +103,7 @@ def choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) ->
     result.points_dropped += points
     if is_last:
         result.moving = drop_moving(mapper)
+        result.points_dropped += mapper.drop_contradicted()
     else:
         mapper.drop(result.moving.tracks)
     if mapper.config.mapping.semantic_triangulation:

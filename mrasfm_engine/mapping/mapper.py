@@ -344,6 +344,19 @@ class Mapper:
         self.is_inlier[alone[lost[self.tracks.of_keypoint[alone]]]] = False
         return int(bad.sum()), int(lost.sum())
 
+    def drop_contradicted(self) -> int:
+        """Drop points of two observations that another one of their track contradicts; how many.
+
+        Two observations on one another's epipolar line agree on a point whatever they show. Where a third is elsewhere,
+        nothing tells which of the matches is wrong, or whether the thing moves.
+        """
+        posed = np.flatnonzero(self.image_posed[self.keypoints.image] & (self.tracks.of_keypoint >= 0))
+        seen = np.bincount(self.tracks.of_keypoint[posed], minlength=len(self.tracks))
+        agreeing = np.bincount(self.tracks.of_keypoint[self.is_inlier], minlength=len(self.tracks))
+        contradicted = np.flatnonzero(self.triangulated & (agreeing == 2) & (seen > 2))
+        self.drop(contradicted)
+        return len(contradicted)
+
     def observation_rows(self, tracks: Ints | None = None) -> Ints:
         """Keypoints that are observations (of the given triangulated tracks, ascending), sorted by track."""
         if tracks is not None:
