@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from mrasfm_engine.aggregation.source import SourceScene, unit_from_images
 from mrasfm_engine.errors import InputError
+from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.read_model import ModelImage, read_images, read_points, read_vertices
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
@@ -23,6 +24,8 @@ from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, component_folde
 
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
+POSES_APART = 1e-3  # of two files, at most: metres, and a rotation's entries
+MAX_SPEED_M_S, FROM_UNIT_M = 100.0, 0.5  # of images, at most, from their unit: by their times, and besides
 NUMBER = re.compile(r"[1-9][0-9]{0,8}")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 NEEDED = (
@@ -107,12 +110,12 @@ def read_scene(folder: Path, name: str) -> SourceScene:
                 remedy=AGAIN,
                 code="scene-version",
             )
-    place = _place(frame, manifest, name)
+    place = _place(folder, frame, manifest, name)
     with _damaged(folder, name):
         scene = _arrays(
             folder,
             name=name,
-            manifest=_with_refined(manifest, calibration),
+            manifest=_with_refined(folder, manifest, calibration, name),
             documents=(frame, poses, calibration, report),
             place=place,
         )
@@ -164,7 +167,8 @@ def _damaged(path: Path, name: str) -> Iterator[None]:
     except InputError:
         raise
     except (
-        OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, sqlite3.Error, StopIteration
+        OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, ArithmeticError, sqlite3.Error,
+        StopIteration,
     ) as error:  # fmt: skip
         raise InputError(
             f"scene {name}: {path} is damaged: {type(error).__name__}: {error}",
@@ -197,7 +201,7 @@ def _own_units(poses: dict[str, Any], registered: Bools, *, is_component: bool) 
     return registered | unposed
 
 
-def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[Floats | None, str | None]:
+def _place(folder: Path, frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[Floats | None, str | None]:
     """ecef_from_local and None, rough_world_from_local and the common world's name, or nothing."""
     if frame.get("georeferenced") is True:
         matrix = frame.get("ecef_from_local")
@@ -207,25 +211,26 @@ def _place(frame: dict[str, Any], manifest: DriveManifest, name: str) -> tuple[F
         if world is None or "rough_world_from_local" not in frame:
             return None, None
         matrix = frame["rough_world_from_local"]
-    with _damaged(Path("frame.json"), name):
+    with _damaged(folder / "frame.json", name):
         result = np.array(matrix, dtype=np.float64)
         rotation = result[:3, :3]
         rigid = result.shape == (4, 4) and np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
         if not rigid or not np.isfinite(result).all() or not np.array_equal(result[3], [0, 0, 0, 1]):
             raise ValueError("the frame's transform is not a rigid one")
+        if frame.get("georeferenced") is True:
+            geodesy.geodetic_from_ecef(result[:3, 3])  # raises where it is not near the earth's surface
     return result, None if frame.get("georeferenced") is True else world
 
 
-def _with_refined(manifest: DriveManifest, calibration: dict[str, Any]) -> DriveManifest:
+def _with_refined(folder: Path, manifest: DriveManifest, calibration: dict[str, Any], name: str) -> DriveManifest:
     """The manifest with the scene's refined calibration in the place of the given one."""
 
     def refined(camera: Camera) -> Camera:
         found = calibration["cameras"][camera.name]["refined"]
-        return camera.model_copy(
-            update={"rig_from_cam": Pose(**found["rig_from_cam"]), "params": [float(v) for v in found["params"]]}
-        )
+        # Validated, as no copy is: parameters that no camera can have would fail much later.
+        return Camera(**dict(camera) | {"rig_from_cam": Pose(**found["rig_from_cam"]), "params": found["params"]})
 
-    with _damaged(Path("calibration.json"), manifest.name):
+    with _damaged(folder / "calibration.json", name):
         cameras = [refined(camera) for camera in manifest.rig.cameras]
     return manifest.model_copy(update={"rig": manifest.rig.model_copy(update={"cameras": cameras})})
 
@@ -246,13 +251,17 @@ def _arrays(
     listed = [image.file for frame in manifest.frames for image in frame.images.values()]
     if len(units) != len(manifest.frames) or sorted(listed) != sorted(image["file"] for image in images):
         raise ValueError("manifest.json and poses.json speak of different images")
+    if not unit_registered[
+        [image["unit"] for image, posed in zip(images, image_registered, strict=True) if posed]
+    ].all():
+        raise ValueError("poses.json has images with a pose of units without one")
     sigma = [unit.get("sigma_position_m", [np.nan] * 3) for unit in units]
     rig_from_cam = {c.name: matrix_from_pose(c.rig_from_cam) for c in manifest.rig.cameras}
     model = read_images(folder / "model" / "images.bin")
     points = read_points(folder / "model" / "points3D.bin")
     first, xy, point, descriptors = _keypoints(folder, model, len(images), len(points.xyz_m))
     kind = features_kind(report)
-    return SourceScene(
+    result = SourceScene(
         name=name,
         manifest=manifest,
         calibration=calibration,
@@ -281,6 +290,44 @@ def _arrays(
         keypoint_point=point,
         descriptors=descriptors if kind.startswith("sift") else descriptors.view(np.float32),
     )
+    _require_poses_of_model(result, model)
+    _require_images_at_units(result, calibration)
+    return result
+
+
+def _require_poses_of_model(scene: SourceScene, model: Mapping[int, ModelImage]) -> None:
+    """Refuse poses of images that are not the model's: its points would be seen from elsewhere."""
+    rows = [i for i in sorted(model) if i < len(scene.image_registered) and scene.image_registered[i]]
+    if not rows:
+        return
+    found = np.stack([model[i].cam_from_world for i in rows])
+    cam_from_world = se3.transform(se3.rotation_from_quaternion(found[:, [1, 2, 3, 0]]), found[:, 4:])
+    apart = np.abs(cam_from_world @ scene.world_from_cam[rows] - np.eye(4)).max(axis=(1, 2))
+    worst = int(np.argmax(apart))
+    if not apart[worst] <= POSES_APART:
+        raise ValueError(
+            f"poses.json and model/images.bin have different poses of {scene.drive.images[rows[worst]].file}"
+        )
+
+
+def _require_images_at_units(scene: SourceScene, calibration: Mapping[str, Any]) -> None:
+    """Refuse images that are farther from their units than a vehicle drives between their times."""
+    if not len(scene.unit_from_image):
+        return
+    cameras = scene.drive.cameras
+    late_us = [
+        abs(float(calibration["cameras"][camera.name]["refined"].get("time_offset_us") or 0.0))
+        + (camera.readout_us or 0)
+        for camera in cameras
+    ]
+    for k, image in enumerate(scene.drive.images):
+        away_us = abs(image.timestamp_us - int(scene.drive.timestamps_us[image.unit])) + late_us[image.camera]
+        away_m = float(np.linalg.norm(scene.unit_from_image[k, :3, 3]))
+        if not away_m <= FROM_UNIT_M + MAX_SPEED_M_S * away_us / 1e6:
+            raise ValueError(
+                f"poses.json has {image.file} {away_m:.2f} m from its unit, by calibration.json, and at most "
+                f"{away_us / 1e3:.1f} ms from it in time"
+            )
 
 
 def _scale(report: dict[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ class ModelImage:
     """One image of a model."""
 
     name: str
+    cam_from_world: Floats  # (7,) qw qx qy qz tx ty tz
     xy_px: Floats32  # (n, 2)
     point: Ints  # (n,) index into the points, -1 for none
 
@@ -57,7 +58,10 @@ def read_images(path: Path) -> dict[int, ModelImage]:
             # COLMAP writes the largest unsigned number for no point.
             point = np.where(rows["point"] > 0, rows["point"] - 1, -1)
             result[image_id - 1] = ModelImage(
-                name=data[at + 64 : name_end].decode("utf-8"), xy_px=rows["xy"].astype(np.float32), point=point
+                name=data[at + 64 : name_end].decode("utf-8"),
+                cam_from_world=np.frombuffer(data, dtype="<f8", count=7, offset=at + 4),
+                xy_px=rows["xy"].astype(np.float32),
+                point=point,
             )
             at = name_end + 9 + rows.nbytes
     except struct.error as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -83,6 +84,48 @@ def test_damage_is_said_by_name(folder: Path) -> None:
     assert raised.value.code == "scene-version"
     (folder / "frame.json").write_text(json.dumps({**frame, "georeferenced": False}))
     assert not read_scene(folder, "one").is_placed
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        ("poses.json", ["units", 0, "registered", False], "images with a pose of units without one"),
+        ("poses.json", ["images", 0, "world_from_cam", "translation_m", 0, 3.0], "have different poses of .*000.png"),
+        ("frame.json", ["ecef_from_local", 0, 3, 2e7], r"frame.json is damaged.* near the earth's surface"),
+        ("calibration.json", ["cameras", "left", "refined", "params", 0, 0.0], r"scene one: .*calibration.json is dam"),
+        ("calibration.json", ["cameras", "left", "refined", "params", 0, -800.0], "focal length fx"),
+        ("calibration.json", ["cameras", "left", "refined", "params", [800.0]], "has 4 parameters"),
+        ("calibration.json", ["cameras", {}], r"scene one: .*/scene/calibration.json is damaged"),
+    ],
+)
+def test_files_that_no_run_has_written_are_refused_before_any_work(
+    folder: Path, file: str, change: list[Any], said: str
+) -> None:
+    document = json.loads((folder / file).read_text())
+    *path, last, value = change
+    inner = document
+    for step in path:
+        inner = inner[step]
+    inner[last] = value
+    (folder / file).write_text(json.dumps(document))
+    with pytest.raises(InputError, match=said) as raised:
+        read_scene(folder, "one")
+    assert raised.value.code == "damaged-scene"
+
+
+def test_a_unit_that_is_not_where_its_images_are_is_refused(folder: Path) -> None:
+    """Images may be away from their unit as far as it drives until they are taken."""
+    document = json.loads((folder / "poses.json").read_text())
+    document["units"][0]["world_from_rig"]["translation_m"][0] += 5.0
+    (folder / "poses.json").write_text(json.dumps(document))
+    with pytest.raises(InputError, match=r"left/000.png 5.00 m from its unit") as raised:
+        read_scene(folder, "one")
+    assert raised.value.code == "damaged-scene"
+    manifest = json.loads((folder / "manifest.json").read_text())
+    for image in manifest["frames"][0]["images"].values():
+        image["timestamp_us"] = manifest["frames"][0]["timestamp_us"] + 100_000
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+    read_scene(folder, "one")
 
 
 def test_names() -> None:
