@@ -22,6 +22,7 @@ from schemas.file_names import MANIFEST_NAME, is_ignored
 COMPLETE_MARK = REPORT_FILE
 LEFTOVER_AGE_S = 3600.0
 SCRATCH_PREFIX = ".scratch-"
+MOST_REMOVED = 100  # times that other runs remove a folder before it is locked
 LOCK = "lock"  # in a scratch folder, held while its run lives
 
 
@@ -149,13 +150,16 @@ def only_run(out: Path) -> Iterator[None]:
 
 
 def _lock_stages(stages: Path, stack: ExitStack) -> None:
+    removed = 0
     while True:
         try:
             stages.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(stages, os.O_RDONLY | os.O_DIRECTORY)
-        except FileNotFoundError:  # a run that ends has just removed it
-            continue
         except OSError as error:
+            # A run that ends has just removed it; or none can be made there, as in a folder that was deleted.
+            removed += isinstance(error, FileNotFoundError)
+            if isinstance(error, FileNotFoundError) and removed < MOST_REMOVED:
+                continue
             raise storage_error(stages, error) from error
         stack.callback(os.close, descriptor)
         try:

@@ -668,6 +668,21 @@ def test_one_run_at_a_time_makes_a_result_in_a_folder(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
 
 
+def test_a_folder_that_cannot_be_made_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a folder that was deleted, and in /proc, making one fails as if another run had just removed it."""
+    tried = 0
+
+    def fails(self: Path, *_: object, **__: object) -> None:
+        nonlocal tried
+        tried += 1
+        assert tried < 10_000, "it is tried for ever"
+        raise FileNotFoundError(2, "No such file or directory", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", fails)
+    with pytest.raises(StorageError, match="No such file or directory"), only_run(tmp_path / "scene"):
+        pass
+
+
 @pytest.mark.parametrize("report", ['{"summary": {"passed": 3}, "tests": []}', '{"summary": 3}', "[[]]", "[" * 100_000])
 def test_a_report_of_another_program_is_spared(tmp_path: Path, report: str) -> None:
     (tmp_path / "report.json").write_text(report)
