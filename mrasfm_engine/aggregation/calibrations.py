@@ -171,6 +171,10 @@ class MapCalibrations:
     learning: tuple[int, ...] = ()
     too_many: bool = False
 
+    def with_free_places(self) -> MapCalibrations:
+        """The same with cameras that vary in all directions of their places, within their priors."""
+        return replace(self, terms=[_with_free_places(term) for term in self.terms])
+
     def at_priors(self, state: State) -> State:
         """The state with cameras where their priors have them: from far off a prior hardly counts."""
         rotation, position_m = state.camera_rotation.copy(), state.camera_position_m.copy()
@@ -181,6 +185,14 @@ class MapCalibrations:
             else:
                 rotation[term.camera], position_m[term.camera] = term.rotation, term.position_m
         return replace(state, camera_rotation=rotation, camera_position_m=position_m, camera_params=params)
+
+
+def _with_free_places(term: CameraPosePrior | IntrinsicsPrior) -> CameraPosePrior | IntrinsicsPrior:
+    if isinstance(term, IntrinsicsPrior):
+        return term
+    held = term.held.copy()
+    held[:, 3:] = False
+    return replace(term, held=held)
 
 
 def map_calibrations(

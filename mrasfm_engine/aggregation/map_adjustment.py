@@ -7,18 +7,18 @@ and its GNSS positions as prior, with a constant offset per drive that is estima
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.calibrations import map_calibrations
+from mrasfm_engine.aggregation.calibrations import MapCalibrations, map_calibrations
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
 from mrasfm_engine.aggregation.vehicles import Vehicle
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
-from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
@@ -29,6 +29,8 @@ from mrasfm_engine.types import Bools, Floats, Ints
 ROUNDS = 2
 MIN_SHARED_POINTS = 12  # of other scenes that a unit sees, to vary on its own in the overlap
 OBSERVATIONS_OF_IMAGE = 300  # from which poses are estimated
+# Lengths of scenes, beyond which the adjustment has no business: in sigmas that the scene states, of at least so much.
+MOST_LENGTHENED, LEAST_SIGMA_LENGTH, LEAST_SPREAD_M = 3.0, 0.01, 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +58,7 @@ class AdjustedMap:
     too_many_cameras: bool  # for the solver: no scene learns, or even varies its calibration
     dropped_observations: int
     dropped_points: int
+    lengthened: Mapping[int, float]  # scenes that are longer by a factor than they may be by themselves
 
 
 def all_points(owner: Ints) -> Ints:
@@ -109,22 +112,15 @@ def adjust_map(
     problem = _with_cameras(problem, calibrations.at_priors(state))
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
     seen[o.point[free[o.unit]]] = True
-    reports: list[Report] = []
-    positions = {k: with_bias(p, state) for k, p in positions.items()}
-    for _ in range(ROUNDS if free.any() else 0):
-        part = replace(
-            problem.of_points(seen),
-            layout=Layout.from_free(free, cameras, free_intrinsics=calibrations.free_intrinsics),
-            terms=[*_terms(assembly, positions, free), *calibrations.terms],
-        )
-        solution, report = solve_with_chosen_points(
-            part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
-        )
-        reports.append(report)
-        points = problem.state.points_m.copy()
-        points[seen] = solution.points_m
-        problem = replace(problem, state=replace(solution, points_m=points))
-        positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
+    given = problem
+    problem, biased, reports = _varied(assembly, given, seen, free, positions, calibrations, cancel=cancel)
+    lengthened = lengthened_scenes(assembly, given.state, problem.state, free)
+    if lengthened and any(isinstance(term, CameraPosePrior) and term.held[:, 3:].any() for term in calibrations.terms):
+        # Images see less of baselines that are held where they are not, the longer a scene is: let them go instead.
+        loose = calibrations.with_free_places()
+        problem, biased, reports = _varied(assembly, given, seen, free, positions, loose, cancel=cancel)
+        lengthened = lengthened_scenes(assembly, given.state, problem.state, free)
+    positions = biased
     problem = _others_refined(problem, seen, cameras)
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return AdjustedMap(
@@ -137,7 +133,57 @@ def adjust_map(
         too_many_cameras=calibrations.too_many,
         dropped_observations=observations,
         dropped_points=points_dropped,
+        lengthened=lengthened,
     )
+
+
+def _varied(
+    assembly: Assembly,
+    problem: Problem,
+    seen: Bools,
+    free: Bools,
+    positions: dict[int, DrivePositions],
+    calibrations: MapCalibrations,
+    *,
+    cancel: Callable[[], bool],
+) -> tuple[Problem, dict[int, DrivePositions], list[Report]]:
+    """The problem after free units (u,), the points (p,) that they see and calibrations have varied; in turns with the
+    constant errors of positions.
+    """
+    reports: list[Report] = []
+    positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
+    for _ in range(ROUNDS if free.any() else 0):
+        part = replace(
+            problem.of_points(seen),
+            layout=Layout.from_free(free, calibrations.cameras, free_intrinsics=calibrations.free_intrinsics),
+            terms=[*_terms(assembly, positions, free), *calibrations.terms],
+        )
+        solution, report = solve_with_chosen_points(
+            part, assembly.image_size_px, an_image=OBSERVATIONS_OF_IMAGE, cancel=cancel
+        )
+        reports.append(report)
+        points = problem.state.points_m.copy()
+        points[seen] = solution.points_m
+        problem = replace(problem, state=replace(solution, points_m=points))
+        positions = {k: with_bias(p, problem.state) for k, p in positions.items()}
+    return problem, positions, reports
+
+
+def lengthened_scenes(assembly: Assembly, before: State, after: State, free: Bools) -> dict[int, float]:
+    """Factors by which placed scenes got longer, of those that got it by more than they may by their own certainty.
+
+    Those of which no units (u,) vary, or units at one place, have no length.
+    """
+    result = {}
+    for k, scene in enumerate(assembly.scenes):
+        units = np.flatnonzero(free & (assembly.scene_of_unit == k))
+        if not scene.is_placed or len(units) < 2:
+            continue
+        was_m, is_m = (float(np.sqrt(state.unit_position_m[units].var(0).sum())) for state in (before, after))
+        sigma = max(scene.sigma_scale or 0.0, LEAST_SIGMA_LENGTH)
+        if was_m > LEAST_SPREAD_M and abs(np.log(is_m / was_m)) > MOST_LENGTHENED * sigma:
+            result[k] = is_m / was_m
+    return result
 
 
 def _with_cameras(problem: Problem, state: State) -> Problem:

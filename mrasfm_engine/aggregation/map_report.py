@@ -107,6 +107,8 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Make several maps of fewer drives if their scenes' calibrations are uncertain.",
             )
         )
+    for k, factor in result.adjusted.lengthened.items():
+        run.found(_lengthened(result.scenes[k], factor))
     names = result.unconnected
     if len(names) == len(result.scenes):
         refused = any(seam.accepted for seam in result.found_seams)
@@ -126,6 +128,16 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Give drives whose trajectories meet theirs.",
             )
         )
+
+
+def _lengthened(scene: SourceScene, factor: float) -> Finding:
+    """Finding on a scene whose length the last adjustment changed by more than the scene knows it."""
+    known = "" if scene.sigma_scale is None else f", where it knew its length to {100 * scene.sigma_scale:.1f} %"
+    return warning(
+        "scene-lengthened",
+        f"scene {scene.name} is {factor:.2f} times as long in the map as by itself{known}",
+        'Declare sigma_translation_m of cameras that are known better, or set aggregation.final_adjustment to "none".',
+    )
 
 
 def _knocked(vehicle: Vehicle, one: Knocked, names: Sequence[str]) -> Finding:

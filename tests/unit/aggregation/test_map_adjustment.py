@@ -5,19 +5,24 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mrasfm_engine.aggregation import calibrations
+from mrasfm_engine.aggregation import calibrations, map_adjustment
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
 from mrasfm_engine.aggregation.calibrations import calibration_priors, map_calibrations
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.vehicles import vehicles_of
+from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
+from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior
+from mrasfm_engine.bundle_adjustment.solver import Problem, Report
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.scene.state import State
 from mrasfm_engine.synthetic.rigs import true_cameras
 from tests.helpers.small_scenes import (
     CONFIG,
@@ -438,6 +443,39 @@ def test_the_more_units_vary_the_less_counts_what_the_scene_said_of_its_cameras(
     held = CONFIG.bundle_adjustment.model_copy(update={"refine_calibration": False})
     monkeypatch.undo()
     assert calibration_priors(assembly, state, assembly.registered, held) == []
+
+
+@pytest.mark.parametrize("only_held", [True, False])
+def test_a_map_that_gets_longer_than_its_scenes_may_be_lets_go_of_baselines(
+    street: Street, folder: Path, monkeypatch: pytest.MonkeyPatch, only_held: bool
+) -> None:
+    """The longer a map, the less images see of held baselines that are wrong: rendered ones got 24 % longer by that."""
+    drives = [
+        drive_along(street, folder / f"long{only_held}{k}", WAYS[k], cameras_off_deg=0.15, bias_m=BIAS_M[k], seed=k)
+        for k in range(2)
+    ]
+    tried: list[bool] = []
+
+    def longer(problem: Problem, *rest: Any, **options: Any) -> tuple[State, Report]:
+        state, report = solve_with_chosen_points(problem, *rest, **options)
+        priors = [term for term in problem.terms if isinstance(term, CameraPosePrior)]
+        tried.append(all(prior.held[:, 3:].all() for prior in priors))
+        assert tried[-1] or not any(prior.held[:, 3:].any() for prior in priors)
+        factor = 1.2 if len(tried) % 2 == 0 and (tried[-1] or not only_held) else 1.0  # what the last round finds
+        return replace(state, unit_position_m=factor * state.unit_position_m), report
+
+    monkeypatch.setattr(map_adjustment, "solve_with_chosen_points", longer)
+    result = adjusted(drives, "all")
+    assert tried == [True, True, False, False]  # two rounds each
+    first = adjusted(drives, "none").model.state.unit_position_m
+    found = result.model.state.unit_position_m
+    lengths = [np.linalg.norm(np.diff(at[[0, len(WAYS[0]) - 1]], axis=0)) for at in (first, found)]
+    if only_held:
+        assert lengths[1] == pytest.approx(lengths[0], rel=0.02)
+        assert result.lengthened == {}
+    else:
+        assert {*result.lengthened} == {0, 1}
+        assert result.lengthened[0] == pytest.approx(lengths[1] / lengths[0], rel=0.02)
 
 
 def test_baselines_of_a_scene_without_positions_follow_the_other_scenes(street: Street, folder: Path) -> None:
