@@ -16,6 +16,8 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.freed_memory import loading
 from schemas.command_line import output_folder
 
+SHOWN_SIGMAS, SHOWN_DIFFERENCE = 2.0, 0.001  # of lengths of two scenes
+
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the subcommand."""
@@ -84,12 +86,21 @@ def _say(report: dict[str, Any], document: dict[str, Any], out: Path) -> None:
     print(f"  points:           {summary['points']} in {out / 'points.ply'}")
     for seam in document["seams"]:
         if seam["accepted"]:
-            off = f", positions were {seam['positions_off_m']:.2f} m off" if "positions_off_m" in seam else ""
-            print(
-                f"  seam {seam['a']} - {seam['b']}: {seam['inliers']} shared points, "
-                f"residual {seam['residual_before_px']:.1f} -> {seam['residual_after_px']:.2f} px, "
-                f"sigma {100 * seam['sigma_translation_m']:.1f} cm {seam['sigma_rotation_deg']:.3f} deg{off}"
-            )
+            print(f"  {seam_line(seam)}")
         else:
             print(f"  no seam {seam['a']} - {seam['b']}: {seam['reason']}")
     print_findings(report["findings"])
+
+
+def seam_line(seam: dict[str, Any]) -> str:
+    """An accepted seam of `map.json` in a line."""
+    off = f", positions were {seam['positions_off_m']:.2f} m off" if "positions_off_m" in seam else ""
+    scale, sigma = seam.get("scale", 1.0), seam.get("sigma_scale", 0.0)
+    differ = abs(scale - 1.0) > SHOWN_SIGMAS * sigma and abs(scale - 1.0) >= SHOWN_DIFFERENCE
+    lengths = f", lengths differ by {100 * abs(scale - 1.0):.1f} %" if differ else ""
+    return (
+        f"seam {seam['a']} - {seam['b']}: {seam['inliers']} shared points, "
+        f"residual {seam['residual_before_px']:.1f} -> {seam['residual_after_px']:.2f} px, "
+        f"before the last adjustment sigma {100 * seam['sigma_translation_m']:.1f} cm "
+        f"{seam['sigma_rotation_deg']:.3f} deg{lengths}{off}"
+    )

@@ -37,8 +37,8 @@ SEAM_FIGURES = (
     ("inliers", "Shared points", ""),
     ("residual_before_px", "Residual before", "px"),
     ("residual_after_px", "Residual after", "px"),
-    ("sigma_translation_m", "Sigma of the translation", "m"),
-    ("sigma_rotation_deg", "Sigma of the rotation", "deg"),
+    ("sigma_translation_m", "Sigma of the translation before the last adjustment", "m"),
+    ("sigma_rotation_deg", "Sigma of the rotation before the last adjustment", "deg"),
 )
 MOST_NAMED = 12  # of the drives that are not in the map
 SCALE_DIGITS = 5  # where its sigma is not known
