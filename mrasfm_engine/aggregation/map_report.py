@@ -21,6 +21,7 @@ from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.aggregation.vehicles import Knocked, Vehicle
 from mrasfm_engine.bundle_adjustment.solver import Report
+from mrasfm_engine.config import AggregationConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.export.calibration import document_in_map
 from mrasfm_engine.export.map import MapContent
@@ -111,15 +112,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
         run.found(_lengthened(result.scenes[k], factor))
     names = result.unconnected
     if len(names) == len(result.scenes):
-        refused = any(seam.accepted for seam in result.found_seams)
-        run.found(
-            warning(
-                "nothing-connected",
-                "all scenes are placed by positions only: "
-                + ("no seam is left to use" if refused else "no two of them see the same"),
-                "Give drives whose trajectories meet, in similar light, or check their positions.",
-            )
-        )
+        run.found(nothing_connected(result.found_seams, run.config.aggregation))
     elif names:
         run.found(
             warning(
@@ -128,6 +121,28 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Give drives whose trajectories meet theirs.",
             )
         )
+
+
+def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Finding:
+    """Finding on a map without a seam in use, by the seams that every pair of scenes by itself says."""
+    off_m = [seam.quality.get("positions_off_m", 0.0) for seam in found if len(seam.shared) >= settings.min_inliers]
+    if any(seam.accepted for seam in found):
+        why, remedy = "no seam is left to use", "See the loops that do not close."
+    elif not found:
+        why = "positions bring no two of them near enough to be compared"
+        remedy = (
+            "Give drives whose trajectories meet, or check their positions, which may be off by "
+            "aggregation.position_error_m."
+        )
+    elif max(off_m, default=0.0) > settings.position_error_m:
+        why = f"what they share contradicts their positions, by up to {max(off_m):.0f} m"
+        remedy = (
+            "Check positions, height datums and clocks, or set aggregation.position_error_m to what they are off by."
+        )
+    else:
+        why = "no two of them see the same"
+        remedy = "Give drives whose trajectories meet, in similar light, or check their positions."
+    return warning("nothing-connected", f"all scenes are placed by positions only: {why}", remedy)
 
 
 def _lengthened(scene: SourceScene, factor: float) -> Finding:

@@ -51,8 +51,21 @@ def _length_m(scene: SourceScene) -> float:
 
 def nearest_distance_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
     """Smallest horizontal distance between the trajectories of two scenes."""
+    return _nearest_m(a, b, a_from_b)[0]
+
+
+def height_between_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> float:
+    """Height of scene b's trajectory above scene a's where they are horizontally nearest."""
+    return _nearest_m(a, b, a_from_b)[1]
+
+
+def _nearest_m(a: SourceScene, b: SourceScene, a_from_b: Floats) -> tuple[float, float]:
+    """Horizontal distance of two trajectories where it is smallest, and the height of b's above a's there."""
     trajectory = b.trajectory_m @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return float(np.min(cKDTree(a.trajectory_m[:, :2]).query(trajectory[:, :2])[0]))
+    found = cKDTree(a.trajectory_m[:, :2]).query(trajectory[:, :2])
+    apart, nearest = np.asarray(found[0]), np.asarray(found[1])
+    best = int(np.argmin(apart))
+    return float(apart[best]), float(trajectory[best, 2] - a.trajectory_m[nearest[best], 2])
 
 
 def probes(a: SourceScene, b: SourceScene, a_from_b: Floats, config: AggregationConfig) -> list[Probe]:

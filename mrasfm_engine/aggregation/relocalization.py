@@ -175,7 +175,7 @@ class Relocaliser:
             if a_from_b is not None:
                 proposals.append(self._with_all_units(a_from_b, seen))
         if not proposals:
-            return _none(f"of {len(tried)} units with enough matches none finds a pose", len(tried))
+            return _none(_why_none(len(tried)), len(tried))
         best = max(proposals, key=lambda p: (len(p[1]), p[2]))
         return self._judged(best, self._rivals(best, proposals, tried, seen), tried)
 
@@ -226,7 +226,8 @@ class Relocaliser:
         agreeing = best[1]
         reason = ""
         if len(agreeing) < self._config.min_units:
-            reason = f"{len(agreeing)} units agree how the scenes lie, {self._config.min_units} are needed"
+            agree = "1 unit agrees" if len(agreeing) == 1 else f"{len(agreeing)} units agree"
+            reason = f"{agree} how the scenes lie, {self._config.min_units} are needed"
         elif len(agreeing) < MIN_MAJORITY * len(tried):
             reason = f"only {len(agreeing)} of {len(tried)} units agree how the scenes lie"
         elif runner_up > MAX_RUNNER_UP * len(agreeing):
@@ -240,6 +241,12 @@ class Relocaliser:
         shift = np.linalg.norm(se3.apply(one, at[None])[0] - se3.apply(other, at[None])[0])
         turn = float(se3.rotation_angle_deg(one[:3, :3] @ other[:3, :3].T))
         return bool(shift <= SAME_PLACE_M and turn <= SAME_PLACE_DEG)
+
+
+def _why_none(tried: int) -> str:
+    return (
+        f"of {tried} units with enough matches none finds a pose" if tried else "none of the units has enough matches"
+    )
 
 
 def _none(reason: str, tried: int, *, runner_up: int = 0) -> Relocalization:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.image_search import similar_images
-from mrasfm_engine.aggregation.pairs import Probe, guided_pairs, probes
+from mrasfm_engine.aggregation.pairs import Probe, guided_pairs, height_between_m, probes
 from mrasfm_engine.aggregation.relocalization import Matches2D3D, Relocaliser, Relocalization, matches_2d3d
 from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
 from mrasfm_engine.aggregation.seam_refinement import (
@@ -34,6 +34,7 @@ ENOUGH_AGREEING = 4  # units, after which no more are looked for
 ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
 MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # it averages over the bends of both scenes there
+NO_COMMON_VIEWS = "their views do not overlap"
 MIN_POINTS_OF_UNIT = 5  # shared points that a unit sees, for it to be part of the seam
 
 
@@ -98,6 +99,8 @@ def find_seam(
         similar_images(a, b, settings, cancel=cancel) if by_positions is None else probes(a, b, by_positions, settings)
     )
     found, tried = _relocalise(a, b, wanted, cross, config, cancel=cancel, progress=progress)
+    if not wanted and by_positions is not None:
+        found = replace(found, reason=_why_no_views(a, b, by_positions, settings))
     quality: dict[str, Any] = {
         "units_tried": found.units_tried,
         "units_agreeing": len(found.units_agreeing),
@@ -115,6 +118,14 @@ def find_seam(
     return _judged(assembly, by_positions, found, refined, quality, config)
 
 
+def _why_no_views(a: SourceScene, b: SourceScene, by_positions: Floats, settings: AggregationConfig) -> str:
+    """Reason for two scenes without a common view by their positions, heights of different datums among them."""
+    height_m = abs(height_between_m(a, b, by_positions))
+    if height_m <= settings.position_error_m:
+        return NO_COMMON_VIEWS
+    return f"positions put one {height_m:.0f} m above the other: compare the height datums of their drives"
+
+
 def _relocalise(
     a: SourceScene,
     b: SourceScene,
@@ -129,7 +140,7 @@ def _relocalise(
     relocaliser = Relocaliser(b, config.aggregation, seed=config.seed)
     parts: list[CrossMatches] = []
     found = Relocalization(
-        a_from_b=None, reason="their views do not overlap", units_tried=0, units_agreeing=(), runner_up=0, inliers=0
+        a_from_b=None, reason=NO_COMMON_VIEWS, units_tried=0, units_agreeing=(), runner_up=0, inliers=0
     )
     # From the start and from the middle at once, so that the first units are not all at one place.
     order = [wanted[i] for k in range(BATCH_UNITS) for i in range(k, len(wanted), BATCH_UNITS)]

@@ -10,6 +10,7 @@ import pytest
 
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
+from mrasfm_engine.aggregation.map_report import nothing_connected
 from mrasfm_engine.aggregation.scene_matching import CrossMatcher, CrossMatches
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.seam_refinement import Shared, adjust_transform, matches_fit, merge_points, scale_ratio
@@ -156,6 +157,34 @@ def test_positions_that_contradict_are_named(street: Street, folder: Path, a: Dr
     assert seam_of(a, far).accepted
 
 
+def test_heights_that_keep_views_apart_are_named(a: Driven, b: Driven) -> None:
+    """As where one receiver counts heights from the ellipsoid, and another one from the sea."""
+    high = replace(b.source, ecef_from_local=b.source.ecef_from_local @ se3.transform(np.eye(3), [0, 0, 47.0]))
+    seam = seam_of(a, replace(b, source=high))
+    assert not seam.accepted
+    assert seam.reason == "positions put one 48 m above the other: compare the height datums of their drives"
+    elsewhere = seam_of(a, replace(b, source=high), configured(position_error_m=60.0))
+    assert elsewhere.accepted, elsewhere.reason
+
+
+@pytest.mark.parametrize(
+    ("position_error_m", "why", "remedy"),
+    [
+        (12.0, "no seam is left to use", "loops"),
+        (4.0, "what they share contradicts their positions, by up to 5 m", "position_error_m"),
+    ],
+)
+def test_why_nothing_is_connected(
+    street: Street, folder: Path, a: Driven, position_error_m: float, why: str, remedy: str
+) -> None:
+    far = drive_along(street, folder / f"why {why}", WAY_B, bias_m=(4.0, 3.0, 0.0), seed=3)
+    config = configured(position_error_m=position_error_m)
+    finding = nothing_connected([seam_of(a, far, config)], config.aggregation)
+    assert finding.what == f"all scenes are placed by positions only: {why}"
+    assert remedy in finding.remedy
+    assert "near enough to be compared" in nothing_connected([], config.aggregation).what
+
+
 def test_scenes_that_share_nothing(folder: Path, a: Driven) -> None:
     elsewhere = drive_along(make_street(length_m=20.0, points=800, seed=9), folder / "elsewhere", WAY_B, seed=4)
     seam = seam_of(a, elsewhere)
@@ -165,6 +194,7 @@ def test_scenes_that_share_nothing(folder: Path, a: Driven) -> None:
     away = replace(a.source, ecef_from_local=a.source.ecef_from_local @ se3.transform(np.eye(3), [300.0, 0, 0]))
     seam = seam_of(a, replace(elsewhere, source=away))
     assert (seam.accepted, seam.reason) == (False, "their views do not overlap")
+    assert nothing_connected([seam], CONFIG.aggregation).what.endswith("no two of them see the same")
 
 
 @pytest.mark.parametrize("scale", [0.97, *slow(1.03)])
