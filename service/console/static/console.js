@@ -204,8 +204,8 @@ import{a as Y}from"./chunk-3KDXTX4X.js";import{A as me,B as ue,C as he,D as d,E 
       ${e.inliers!==void 0&&t`<${i} label="Shared points">${l(e.inliers)}<//>`}
       ${s("Residual before",e.residual_before_px,"px")}
       ${s("Residual after",e.residual_after_px,"px")}
-      ${s("Sigma of the translation",e.sigma_translation_m,"m")}
-      ${s("Sigma of the rotation",e.sigma_rotation_deg,"deg")}
+      ${s("Sigma of the translation before the last adjustment",e.sigma_translation_m,"m")}
+      ${s("Sigma of the rotation before the last adjustment",e.sigma_rotation_deg,"deg")}
       ${e.scale!==void 0&&t`<${i} label="Difference of scale"><span data-exact=${e.scale}>${H(100*(e.scale-1),3)} %</span><//>`}
     </dl>
     ${e.pictures?t`<${Y} before=${D(o,e.pictures.before)} after=${D(o,e.pictures.after)} label="Points of both scenes from above" />`:t`<p class="muted">${e.accepted?"There are no pictures: they were switched off.":"There are no pictures, because the seam is not used."}</p>`}

@@ -143,8 +143,8 @@ function SeamBox({ seam, base }: { seam: Seam; base: string; version: MapVersion
       ${seam.inliers !== undefined && html`<${Tile} label="Shared points">${count(seam.inliers)}<//>`}
       ${figure("Residual before", seam.residual_before_px, "px")}
       ${figure("Residual after", seam.residual_after_px, "px")}
-      ${figure("Sigma of the translation", seam.sigma_translation_m, "m")}
-      ${figure("Sigma of the rotation", seam.sigma_rotation_deg, "deg")}
+      ${figure("Sigma of the translation before the last adjustment", seam.sigma_translation_m, "m")}
+      ${figure("Sigma of the rotation before the last adjustment", seam.sigma_rotation_deg, "deg")}
       ${seam.scale !== undefined && html`<${Tile} label="Difference of scale"><span data-exact=${seam.scale}>${significant(100 * (seam.scale - 1), 3)} %</span><//>`}
     </dl>
     ${seam.pictures
