@@ -117,10 +117,13 @@ def _say(report: dict[str, Any], out: Path) -> None:
     stages = {stage["stage"]: stage for stage in report["stages"]}
     mapping, refinement = stages["mapping"], stages["refinement"]
     others = mapping["components"][1:]
-    units = mapping["registered_units"] + len(mapping["units_not_registered"]) + sum(other["units"] for other in others)
+    between = refinement["between_keyframes"]
+    registered = mapping["registered_units"] + between["registered"]
+    missing = [*mapping["units_not_registered"], *between["units_not_registered"]]
+    units = registered + len(missing) + sum(other["units"] for other in others)
     standing = report.get("standing", {"units": 0})["units"]
     print(f"Scene: {out}")
-    print(f"  units registered: {mapping['registered_units']} of {units}")
+    print(f"  units registered: {registered} of {units}")
     if standing:
         print(f"  units standing:   {standing} more, posed between the ends of their stops")
     for number, other in enumerate(others, start=1):
@@ -144,7 +147,7 @@ def _say(report: dict[str, Any], out: Path) -> None:
     for camera, images in Counter(image["camera"] for image in mapping["images_occluded"]).items():
         print(f"  occluded:         {camera} in {images} images, by something that moves along")
     print_findings(report["findings"])
-    for frames, reason in _missing(mapping["units_not_registered"]):
+    for frames, reason in _missing(sorted(missing, key=lambda unit: unit["unit"])):
         print(f"  not registered:   {frames}: {reason}")
 
 
