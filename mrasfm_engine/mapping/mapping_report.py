@@ -19,11 +19,11 @@ from mrasfm_engine.mapping.moving_objects import REASONS, MovingTracks
 from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.road import RoadAssessment
-from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_MATCHES, Registration
+from mrasfm_engine.mapping.unit_registration import MIN_CAMERA_INLIER_RATIO, MIN_CAMERA_MATCHES, Registration
 from mrasfm_engine.scene.road import RoadSource
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.types import Bools, Ints
-from schemas.findings import Finding, warning
+from schemas.findings import Finding, listed, warning
 
 # At two sigmas of more a lane of 3.5 m is a third of a metre wider or narrower, and is taken for another kind of lane.
 MAX_SIGMA_SCALE = 0.05
@@ -133,6 +133,28 @@ def idle_camera_findings(mapper: Mapper) -> list[Finding]:
             "params may be.",
         )
         for name, found, posed in _cameras_all_along(mapper, _is_poorly_seen(mapper) & matched)
+    ]
+
+
+def contradicting_image_findings(mapper: Mapper) -> list[Finding]:
+    """The finding on single images most of whose points lie elsewhere in them, by the poses of their units."""
+    rows = np.flatnonzero(mapper.triangulated[mapper.tracks.of_keypoint])
+    images = len(mapper.image_unit)
+    shown = np.bincount(mapper.keypoints.image[rows], minlength=images)
+    fitting = np.bincount(mapper.keypoints.image[rows[mapper.is_inlier[rows]]], minlength=images)
+    found = mapper.image_posed & (shown >= MIN_CAMERA_MATCHES) & (fitting < MIN_CAMERA_INLIER_RATIO * shown)
+    if not found.any():
+        return []
+    files = [mapper.drive.images[i].file for i in np.flatnonzero(found).tolist()]
+    return [
+        warning(
+            "images-against-rig",
+            f"{len(files)} of {int(mapper.image_posed.sum())} images contradict the poses of their units: "
+            f"{listed(files)}",
+            "They have hardly any part in the scene. Check that each is of its camera and of its time: files may be "
+            "exchanged, late or repeated. Where one other camera alone says where the unit is, that one may be the "
+            "wrong one, and sigma_position_m does not hold it.",
+        )
     ]
 
 

@@ -41,11 +41,20 @@ class Vote:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Expectation:
+    """Pose of the unit by its motion; the covariance as that of a vote."""
+
+    world_from_rig: Floats  # (4, 4)
+    covariance: Floats  # (6, 6)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Agreement:
     """Pose on which the largest group of cameras agrees."""
 
     world_from_rig: Floats  # (4, 4)
     agreeing: Bools  # (votes,)
+    by_motion: bool = False  # the expected pose contradicts a better supported group of as many cameras
 
 
 def calibration_covariance(
@@ -66,8 +75,11 @@ def calibration_covariance(
     return result
 
 
-def largest_agreement(votes: list[Vote]) -> Agreement | None:
+def largest_agreement(votes: list[Vote], expected: Expectation | None = None) -> Agreement | None:
     """The average of the largest group of votes, of equally large ones the better supported; None without votes.
+
+    Of equally large groups, those that an expected pose agrees with come first. Two cameras that differ have no
+    majority, and an image of another instant observes as many points as the right one of the other camera.
 
     The L1 average of all votes comes first (MRASfM, eq. 6): while most cameras are right it is near them. Without a
     majority (two cameras against two) it lies in between and is right for nobody, so the votes themselves are tried as
@@ -83,8 +95,15 @@ def largest_agreement(votes: list[Vote]) -> Agreement | None:
     covariance = _covariances(votes, spread)
     groups = [_near(votes, covariance, average, spread)]
     groups += [_near(votes, covariance + own, pose, spread) for own, pose in zip(covariance, poses, strict=True)]
-    group = max(groups, key=lambda g: (g.sum(), inliers[g].sum()))
-    return Agreement(world_from_rig=_mean(poses[group], covariance[group]), agreeing=group)
+    groups.sort(key=lambda g: (g.sum(), inliers[g].sum()), reverse=True)
+    largest = [g for g in groups if g.sum() == groups[0].sum()]
+    means = [_mean(poses[g], covariance[g]) for g in largest]
+    chosen = 0
+    if expected is not None:
+        apart = [expected.covariance + np.linalg.inv(np.linalg.inv(covariance[g]).sum(0)) for g in largest]
+        squares = squared_lengths(_differences(np.stack(means), expected.world_from_rig), np.stack(apart))
+        chosen = int(np.argmax(squares <= chdtri(DOF, DISAGREEMENT)))  # the first one that agrees; none: the first
+    return Agreement(world_from_rig=means[chosen], agreeing=largest[chosen], by_motion=chosen > 0)
 
 
 def agree(votes: list[Vote], world_from_rig: Floats) -> Bools:

@@ -14,6 +14,7 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.problem import RowBandMotion
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.gnss_track import HARDEST_MPS2
 from mrasfm_engine.geometry.local_motion import (
     MAX_GAP_S,
     LocalMotion,
@@ -150,9 +151,7 @@ class RigMotion:
 
     def expected_pose(self, state: State, registered: Bools, unit: int) -> Floats | None:
         """Predict the pose (4, 4) of a unit from the two registered units nearest in time; None where these are far."""
-        known = np.flatnonzero(registered)
-        known = known[known != unit]
-        nearest = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
+        nearest = self._nearest_two(registered, unit)
         if len(nearest) < 2:
             return None
         pair = np.sort(nearest)
@@ -162,6 +161,21 @@ class RigMotion:
         if not around.known.all() or abs(elapsed_s) > MAX_GAP_S:
             return None
         result: Floats = state.world_from_rig_of(pair)[near] @ moved(elapsed_s * around.velocity[near : near + 1])[0]
+        return result
+
+    def expected_sigma_m(self, registered: Bools, unit: int) -> float:
+        """Standard deviation of each axis of that pose's position, by accelerations of which the hardest is two sigmas.
+
+        A line through two places of a path is off by half the acceleration times the product of the times to both.
+        """
+        to_both_s = self._time_s[self._nearest_two(registered, unit)] - self._time_s[unit]
+        return 0.5 * (HARDEST_MPS2 / 2.0) * float(np.abs(to_both_s).prod())
+
+    def _nearest_two(self, registered: Bools, unit: int) -> Ints:
+        """The two other registered units that are nearest in time; fewer where there are fewer."""
+        known = np.flatnonzero(registered)
+        known = known[known != unit]
+        result: Ints = known[np.argsort(np.abs(self._time_s[known] - self._time_s[unit]), kind="stable")[:2]]
         return result
 
     def left_out(self, state: State, registered: Bools) -> tuple[Floats, Floats]:

@@ -9,6 +9,7 @@ unit, also those with too few points to be registered alone.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,7 +21,13 @@ from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.geometry.colmap_cameras import SolverCameras
 from mrasfm_engine.mapping.inlier_gates import gates_px, observation_gate_px, robust_sigma, widest_gates_px
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.per_camera_pnp import Vote, agree, calibration_covariance, largest_agreement
+from mrasfm_engine.mapping.per_camera_pnp import (
+    Expectation,
+    Vote,
+    agree,
+    calibration_covariance,
+    largest_agreement,
+)
 from mrasfm_engine.mapping.resection import pose_information, resect
 from mrasfm_engine.matching.simultaneous import INDEPENDENT_MATCHES, MIN_SIGMA_PX, calibration_sigmas
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -95,12 +102,14 @@ class CameraViews:
 def register_unit(mapper: Mapper, unit: int) -> Registration:
     """Find the pose of a unit from the points of its tracks."""
     expected = mapper.motion.expected_pose(mapper.state, mapper.registered, unit)
+    sigma_m = None if expected is None else mapper.motion.expected_sigma_m(mapper.registered, unit)
     return register_from_correspondences(
         mapper,
         unit,
         correspondences_of_unit(mapper, unit),
         min_inliers=mapper.config.mapping.min_pnp_inliers,
         expected=expected,
+        expected_sigma_m=sigma_m,
     )
 
 
@@ -112,6 +121,7 @@ def register_from_correspondences(
     min_inliers: int,
     by_vote: bool = True,
     expected: Floats | None = None,
+    expected_sigma_m: float | None = None,
 ) -> Registration:
     """Find the pose of a unit from given correspondences.
 
@@ -121,6 +131,8 @@ def register_from_correspondences(
         Also by the cameras' own poses.
     expected
         Where the unit (4, 4) is by the motion of others, if they tell.
+    expected_sigma_m
+        Standard deviation of each axis of that place; with it, the motion decides between cameras without a majority.
     """
     if len(matched.camera) < min_inliers:
         return failed(unit, matched, 0, f"it sees {len(matched.camera)} points of the scene, {min_inliers} are needed")
@@ -130,13 +142,15 @@ def register_from_correspondences(
     required = mapper.config.mapping.min_pnp_inlier_ratio
     if by_vote and (fit.inlier.mean() < required or _disagreeing(mapper, matched, fit.inlier)):
         votes = camera_votes(mapper, sample)
-        average = largest_agreement(votes)
+        average = largest_agreement(votes, _expectation(expected, expected_sigma_m))
         by_votes = _Fit.to(mapper, None if average is None else average.world_from_rig, matched)
-        if average is not None and by_votes.holds_against(fit, matched.camera):
+        if average is not None and (average.by_motion or by_votes.holds_against(fit, matched.camera)):
             fit, method = by_votes, "vote"
     count = int(fit.inlier.sum())
     if fit.world_from_rig is None or count < min_inliers or count < required * len(fit.inlier):
-        return failed(unit, matched, count, f"only {count} of {len(fit.inlier)} points agree with one pose")
+        needed = max(min_inliers, math.ceil(required * len(fit.inlier)))
+        reason = f"only {count} of {len(fit.inlier)} points agree with one pose, {needed} are needed"
+        return failed(unit, matched, count, reason)
     return Registration(
         unit=unit,
         world_from_rig=fit.world_from_rig,
@@ -145,6 +159,14 @@ def register_from_correspondences(
         method=method,
         voted_out=_others(mapper, votes, fit.world_from_rig),
         unclear=tuple(n for n in _disagreeing(mapper, matched, fit.inlier) if n not in _names(mapper, votes)),
+    )
+
+
+def _expectation(expected: Floats | None, sigma_m: float | None) -> Expectation | None:
+    if expected is None or sigma_m is None:
+        return None
+    return Expectation(
+        world_from_rig=expected, covariance=np.diag(np.repeat([PREDICTION_RAD, sigma_m], 3).astype(np.float64) ** 2)
     )
 
 

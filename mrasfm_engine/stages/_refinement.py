@@ -155,6 +155,7 @@ def _refined(
         names = [camera.name for camera in run.drive.cameras]
         findings.append(miscalibration.pair_finding(names, refined.wrong_pair))
     findings += mapping_report.idle_camera_findings(mapper)
+    findings += mapping_report.contradicting_image_findings(mapper)
     findings += mapping_report.motion_findings(mapper)
     findings += mapping_report.scale_findings(mapper, refined) + length_findings(mapper, refined)
     report = {

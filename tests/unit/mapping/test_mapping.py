@@ -12,7 +12,12 @@ from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, run_incremental_mapping
 from mrasfm_engine.mapping.initialization import UnitScores, initialise
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.mapping_report import covered_camera_findings, describe, idle_camera_findings
+from mrasfm_engine.mapping.mapping_report import (
+    contradicting_image_findings,
+    covered_camera_findings,
+    describe,
+    idle_camera_findings,
+)
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement import refine
 from tests.helpers.simulated_drive import (
@@ -405,3 +410,20 @@ def test_a_camera_that_observes_hardly_a_point_all_along_is_a_finding() -> None:
     assert f"of 8 images of camera {simulated.drive.cameras[1].name} have matches" in finding.what
     mapper.missing[of_camera] = True  # images that are left out have findings of their own
     assert idle_camera_findings(mapper) == []
+
+
+def test_single_images_that_contradict_their_unit_are_a_finding() -> None:
+    """One image of another camera in one frame: its unit has its pose from the others, and nothing else says so."""
+    simulated = make_simulated_drive(units=8, cameras=3, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(8))
+    mapper.complete()
+    assert contradicting_image_findings(mapper) == []
+    image = next(i for i, one in enumerate(simulated.drive.images) if (one.unit, one.camera) == (4, 1))
+    mapper.is_inlier &= mapper.keypoints.image != image
+    (finding,) = contradicting_image_findings(mapper)
+    assert finding.code == "images-against-rig"
+    assert finding.what.startswith("1 of 24 images contradict the poses of their units: images/")
+    assert finding.what.endswith(simulated.drive.images[image].file)
+    # Of one whose points were taken out, as those of a lorry are, there is nothing to say.
+    mapper.triangulated[mapper.tracks.of_keypoint[mapper.keypoints.image == image]] = False
+    assert contradicting_image_findings(mapper) == []

@@ -5,6 +5,7 @@ import pytest
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.per_camera_pnp import (
+    Expectation,
     Vote,
     agree,
     calibration_covariance,
@@ -142,6 +143,34 @@ def test_of_two_that_differ_one_is_believed_and_not_their_mean() -> None:
     assert found is not None
     np.testing.assert_array_equal(found.agreeing, [True, False])
     assert errors(found.world_from_rig)[0] < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("right_m", "wrong_m", "sigma_m", "by_motion"),
+    [
+        (0.0, 3.0, 0.05, True),
+        (0.1, 3.0, 0.05, True),  # as far off as motion predicts
+        (0.0, 0.6, 0.5, False),  # the vehicle may be at either
+        (2.0, 3.0, 0.05, False),  # and here at none
+    ],
+)
+def test_of_two_that_differ_the_one_is_right_that_is_where_motion_predicts(
+    right_m: float, wrong_m: float, sigma_m: float, by_motion: bool
+) -> None:
+    votes = [vote(0, moved_m=right_m, inliers=50), vote(1, moved_m=wrong_m, inliers=60)]
+    motion = Expectation(world_from_rig=TRUE, covariance=np.diag(np.repeat([0.05, sigma_m], 3) ** 2))
+    found = largest_agreement(votes, motion)
+    assert found is not None
+    assert found.by_motion == by_motion
+    np.testing.assert_array_equal(found.agreeing, [by_motion, not by_motion])
+
+
+def test_a_majority_needs_no_motion() -> None:
+    votes = [vote(0, inliers=100), vote(1, inliers=50, moved_m=3.0), vote(2, inliers=50, moved_m=3.0)]
+    motion = Expectation(world_from_rig=TRUE, covariance=np.diag(np.repeat([0.05, 0.05], 3) ** 2))
+    found = largest_agreement(votes, motion)
+    assert found is not None
+    np.testing.assert_array_equal(found.agreeing, [False, True, True])
 
 
 def test_cameras_whose_pose_is_more_certain_count_for_more() -> None:

@@ -91,6 +91,8 @@ def test_the_expected_pose_follows_from_the_units_around() -> None:
     position_m, rotation_deg = off(expected, true[UNIT])
     assert 1e-6 < position_m < 0.1
     assert rotation_deg < 1.0
+    # Between two units that are 0.1 s away: an eighth of the hardest acceleration times the square of 0.2 s, halved.
+    np.testing.assert_allclose(mapper.motion.expected_sigma_m(mapper.registered, UNIT), 0.025)
     alone = np.zeros_like(mapper.registered)
     alone[0] = True
     assert mapper.motion.expected_pose(mapper.state, alone, UNIT) is None

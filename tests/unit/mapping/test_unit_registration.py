@@ -177,6 +177,21 @@ def test_two_cameras_against_two() -> None:
     assert turn < 0.3 or 5.7 < turn < 6.3
 
 
+@pytest.mark.parametrize("camera", [0, 1])
+@pytest.mark.parametrize("of_unit", [2, 4, 7])
+def test_an_image_of_another_instant_does_not_move_a_unit_of_two_cameras(camera: int, of_unit: int) -> None:
+    """It repeats an image of the scene, so that more of its points fit than of the right one."""
+    simulated = make_simulated_drive(units=9, cameras=2, points=1500)
+    at, late = (2 * unit + camera for unit in (UNIT, of_unit))
+    for of_images in (simulated.features, simulated.point_of_keypoint):
+        of_images[at] = of_images[late]
+    mapper = with_true_poses(make_model(simulated), simulated, [u for u in range(9) if u != UNIT])
+    result = register_unit(mapper, UNIT)
+    assert result.world_from_rig is not None
+    assert result.voted_out == (simulated.drive.cameras[camera].name,)
+    assert 1e-5 < errors(result.world_from_rig, simulated)[0] < 0.1
+
+
 def test_all_cameras_but_one_are_covered() -> None:
     """What covers them shows points that fit no pose of the unit; they have no vote, and are not called wrong."""
     simulated, mapper = scene()
@@ -228,6 +243,8 @@ def test_points_that_fit_no_pose_are_a_reason() -> None:
     result = register_unit(mapper, UNIT)
     assert result.world_from_rig is None
     assert "agree with one pose" in result.reason
+    least = int(np.ceil(mapper.config.mapping.min_pnp_inlier_ratio * result.correspondences))
+    assert result.reason.endswith(f", {least} are needed")
     assert result.inliers < 0.2 * result.correspondences
 
 
