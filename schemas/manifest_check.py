@@ -224,8 +224,9 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
     turned = upright < np.cos(np.radians(MAX_CAMERA_ROLL_DEG))
     if not turned.any():
         return []
-    names = listed([camera.name for camera, is_turned in zip(manifest.rig.cameras, turned, strict=True) if is_turned])
-    what = f"camera {names} is turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
+    names = [camera.name for camera, is_turned in zip(manifest.rig.cameras, turned, strict=True) if is_turned]
+    cameras = f"camera {names[0]} is" if len(names) == 1 else f"cameras {listed(names)} are"
+    what = f"rig.cameras: {cameras} turned by over {MAX_CAMERA_ROLL_DEG:g} degrees against the vehicle's upright"
     remedy = (
         "Check rig.body_axes, that rig_from_cam is the camera's pose in the rig, not its inverse, and that its "
         "quaternion ends with w; camera axes are x right, y down, z forward."
@@ -234,7 +235,7 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
     ahead = np.abs(axes[:, 1] @ forward) > np.cos(np.radians(LEVEL_DEG))
     on_edge = np.abs(upright) < np.sin(np.radians(LEVEL_DEG))
     if not turned.all():
-        return [warning("camera-turned", what, remedy)]
+        return [warning("camera-turned", what, f"Nothing needs to be done where it is mounted so. {remedy}")]
     if level.all() and ahead.any() and on_edge.all():
         return [warning("rig-axes", what, f"Nothing needs to be done where they stand on edge. {remedy}")]
     return [

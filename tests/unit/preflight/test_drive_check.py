@@ -384,10 +384,12 @@ def test_rough_poses_in_a_world_with_z_down(drive_document: Document, write_driv
 def test_wrong_axes_of_the_whole_rig(drive_document: Document, write_drive: WriteDrive) -> None:
     first, second = drive_document["rig"]["cameras"]
     first["rig_from_cam"]["rotation_xyzw"] = [0, 0, 0, 1]  # KITTI's, declared as ours
-    assert "camera left" in only(write_drive(drive_document), "camera-turned", Severity.WARNING).what
+    finding = only(write_drive(drive_document), "camera-turned", Severity.WARNING)
+    assert "camera left is turned" in finding.what
+    assert "where it is mounted so" in finding.remedy  # upside down, or on edge
     second["rig_from_cam"]["rotation_xyzw"] = [0.5, -0.5, 0.5, 0.5]  # the inverse of what it should be
     finding = only(write_drive(drive_document), "rig-axes", Severity.ERROR)
-    assert "left, right" in finding.what
+    assert "cameras left, right are turned" in finding.what
     drive_document["rig"]["body_axes"] = "rdf"
     second["rig_from_cam"]["rotation_xyzw"] = [0, 0, 0, 1]
     drive_document["gnss"]["antenna_in_rig_m"] = [0, -1.8, 0]
