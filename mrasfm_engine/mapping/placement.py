@@ -99,7 +99,8 @@ def place_by_gnss(
     else:
         alignment = align(known)
     if isinstance(alignment, Refusal):
-        return Placement(reason=alignment.reason, is_of_another_scale=alignment.is_of_scale)
+        reason = alignment.reason + (_left_out(gnss) if len(units) < MIN_POSITIONS else "")
+        return Placement(reason=reason, is_of_another_scale=alignment.is_of_scale)
     alignment, known = _moved(mapper, gnss, antenna_in_rig_m, alignment, known, align)
     placement = Placement(
         alignment=alignment,
@@ -116,8 +117,16 @@ def place_by_gnss(
     placement = with_prior(mapper, placement, thorough=thorough)
     if not single:
         placement = replace(placement, scale_of_rig=_scale_by_positions(mapper, placement))
-        placement.findings = clock_findings(mapper, placement) + rig_scale_findings(mapper, placement)
+        placement.findings = clock_findings(mapper, placement)
     return placement
+
+
+def _left_out(gnss: GnssTrack) -> str:
+    """Words on the samples that take no part, as they are far from those around them; none where there are none."""
+    wrong = int((~gnss.good).sum() - gnss.held.sum())
+    if not wrong:
+        return ""
+    return f"; {wrong} of {len(gnss.good)} samples are left out, as they are far from those around them by their sigmas"
 
 
 def _moved(
@@ -349,13 +358,30 @@ def _scale_by_positions(mapper: Mapper, placement: Placement) -> float:
     Where the receiver's error jumps, an alignment of all positions does not tell it: the term does. Baselines may have
     taken the receiver's scale already.
     """
-    alignment, positions = placement.alignment, placement.prior
+    alignment = placement.alignment
     assert alignment is not None
+    growth = _growth_by_term(mapper, placement) if len(placement.jumps) else alignment.scale - 1.0
+    return (1.0 + growth) / scale_of_baselines(mapper)[0]
+
+
+def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
+    """Say by the refined scene what positions make of the rig's lengths as given, and find where they contradict it.
+
+    While cameras were where they were given, the scene had another scale by whatever was wrong of them: a rotation or
+    the times of their images as much as a baseline. An adjustment puts that where images show it.
+    """
+    if placement.prior is None or mapper.drive.has_single_camera:
+        return placement
+    scale = (1.0 + _growth_by_term(mapper, placement)) / scale_of_baselines(mapper)[0]
+    placement = replace(placement, scale_of_rig=float(scale))
+    return replace(placement, findings=[*placement.findings, *rig_scale_findings(mapper, placement)])
+
+
+def _growth_by_term(mapper: Mapper, placement: Placement) -> float:
+    """Growth of the scene, relative, that makes it fit positions best by what is known of their errors."""
+    positions = placement.prior
     assert positions is not None
-    if not len(placement.jumps):
-        return alignment.scale / scale_of_baselines(mapper)[0]
     antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
     off_m = (positions.position_m - antenna_m)[:, :, None]
     known = positions.information(np.concatenate([similarity_motions(antenna_m), off_m], axis=2))
-    growth = np.linalg.lstsq(known[:-1, :-1], known[:-1, -1], rcond=1e-12)[0][-1]
-    return float((1.0 + growth) / scale_of_baselines(mapper)[0])
+    return float(np.linalg.lstsq(known[:-1, :-1], known[:-1, -1], rcond=1e-12)[0][-1])

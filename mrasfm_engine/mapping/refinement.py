@@ -36,6 +36,7 @@ from mrasfm_engine.mapping.miscalibration import (
 from mrasfm_engine.mapping.most_likely_size import take_most_likely_size
 from mrasfm_engine.mapping.moving_objects import drop_moving
 from mrasfm_engine.mapping.other_sizes import parts_of
+from mrasfm_engine.mapping.placement import compare_with_rig
 from mrasfm_engine.mapping.receiver_findings import contradicts_rig
 from mrasfm_engine.mapping.refinement_result import (
     Refinement,
@@ -89,6 +90,8 @@ def refine(
     result.certainty = certainty_of(mapper, result)
     take_most_likely_size(mapper, result, free_units, cancel=cancel)
     _assess(mapper, result, free_units, cancel)
+    if result.placement is not None:
+        result.absolute.placement = compare_with_rig(mapper, result.placement)
     if progress is not None:
         progress(ROUNDS + 1, ROUNDS + 1)
     return result

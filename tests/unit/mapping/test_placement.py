@@ -98,6 +98,19 @@ def test_a_jump_is_one_where_the_scene_is_bent_as_well() -> None:
     assert np.sqrt((found.errors_m**2).mean()) < 0.03
 
 
+def test_a_receiver_whose_samples_are_all_left_out_is_refused_with_their_number() -> None:
+    """As one that declares a tenth of its noise: the scene does have positions at its times."""
+    simulated = make_simulated_drive(units=12, cameras=2, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(12))
+    gnss = received(simulated, 0.3)
+    good = np.arange(12) < 2
+    refused = place_by_gnss(mapper, replace(gnss, good=good), ARM_M)
+    assert refused.prior is None
+    assert refused.reason.startswith("only 2 registered units have a position at their time, 3 are needed; 10 of 12 ")
+    held = place_by_gnss(mapper, replace(gnss, good=good, held=~good), ARM_M)
+    assert held.reason.endswith("3 are needed")
+
+
 def errors(
     off_m: np.ndarray, *, interval_us: float = 100_000.0, likely: bool = False, noise_factor: float = 1.0
 ) -> ReceiverErrors:

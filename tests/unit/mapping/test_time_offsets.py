@@ -6,9 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
+from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.time_offsets import assess_times, offsets_are_steady, time_prior, times_may_vary
@@ -37,20 +40,21 @@ def model(
     *,
     apart: bool = True,
     taken_ms: list[int] | None = None,
+    cameras: int = 4,
     **camera: Any,
 ) -> tuple[Mapper, SimulatedDrive]:
     """A drive at its true poses, whose cameras take images so much later than their timestamps."""
     simulated = make_simulated_drive(
         units=UNITS,
-        cameras=4,
+        cameras=cameras,
         points=2500,
         travelled_m=TRAVELLED_M,
         time_offset_ms=taken_ms or (APART_MS if apart else late_ms),
         late_ms=late_ms,
     )
     rig = simulated.drive.manifest.rig
-    cameras = [c.model_copy(update={"readout_us": 0, "sigma_time_offset_us": 5000.0, **camera}) for c in rig.cameras]
-    simulated = with_cameras(simulated, cameras)
+    given = [c.model_copy(update={"readout_us": 0, "sigma_time_offset_us": 5000.0, **camera}) for c in rig.cameras]
+    simulated = with_cameras(simulated, given)
     return with_true_poses(make_model(simulated, config=config), simulated, range(UNITS)), simulated
 
 
@@ -153,6 +157,19 @@ def test_offsets_are_steady_until_one_moves_among_the_others_by_more_than_its_pr
     ):
         mapper.state.camera_time_offset_s[:] = 1e-3 * np.array(moved_ms)
         assert offsets_are_steady(mapper, np.zeros(4)) == steady
+
+
+def test_a_late_camera_does_not_make_the_receiver_contradict_the_rig() -> None:
+    """As long as its times are as given, the pair makes the scene larger or smaller than its baseline is."""
+    mapper, simulated = model([0, 20], taken_ms=[0, 20], cameras=2)
+    adjust_poses(mapper, np.arange(UNITS) > 0, options=SolverOptions())  # as a scene grows, its cameras held
+    grown = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert 0.05 < abs(grown - 1.0) < 0.3
+    result = refined(mapper, simulated, 0.02)
+    assert result.georeferenced
+    assert result.placement is not None
+    assert 0.0 < abs(result.placement.scale_of_rig - 1.0) < 0.03
+    assert "scale-disagreement" not in {finding.code for finding in result.placement.findings}
 
 
 def test_cameras_that_are_simultaneous_have_no_offset_unless_the_manifest_says_so() -> None:
