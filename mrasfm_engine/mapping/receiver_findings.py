@@ -94,8 +94,9 @@ def rig_scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
         warning(
             "scale-disagreement",
             f"GNSS makes {_length_beside_rig(mapper, placement.scale_of_rig)}",
-            "Check the baselines in rig.cameras (metres), and the receiver's positions (are latitude and longitude "
-            "swapped?). Declare sigma_translation_m of the cameras.",
+            "Check the baselines in rig.cameras (metres), gnss.antenna_in_rig_m (too far aside it makes a turn longer "
+            "or shorter), and the receiver's positions (are latitude and longitude swapped?). "
+            "Declare sigma_translation_m of the cameras.",
         )
     ]
 
