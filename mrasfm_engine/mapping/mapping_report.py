@@ -138,7 +138,8 @@ def idle_camera_findings(mapper: Mapper) -> list[Finding]:
 
 def contradicting_image_findings(mapper: Mapper) -> list[Finding]:
     """The finding on single images most of whose points lie elsewhere in them, by the poses of their units."""
-    rows = np.flatnonzero(mapper.triangulated[mapper.tracks.of_keypoint])
+    of_keypoint = mapper.tracks.of_keypoint
+    rows = np.flatnonzero((of_keypoint >= 0) & mapper.triangulated[of_keypoint])
     images = len(mapper.image_unit)
     shown = np.bincount(mapper.keypoints.image[rows], minlength=images)
     fitting = np.bincount(mapper.keypoints.image[rows[mapper.is_inlier[rows]]], minlength=images)

@@ -424,6 +424,9 @@ def test_single_images_that_contradict_their_unit_are_a_finding() -> None:
     assert finding.code == "images-against-rig"
     assert finding.what.startswith("1 of 24 images contradict the poses of their units: images/")
     assert finding.what.endswith(simulated.drive.images[image].file)
-    # Of one whose points were taken out, as those of a lorry are, there is nothing to say.
+    # Nothing to say of one whose points were taken out, as those of a lorry are, or of one that matches nothing.
     mapper.triangulated[mapper.tracks.of_keypoint[mapper.keypoints.image == image]] = False
+    assert contradicting_image_findings(mapper) == []
+    mapper.tracks.of_keypoint[mapper.keypoints.image == image] = -1
+    mapper.triangulated[-1] = True
     assert contradicting_image_findings(mapper) == []
