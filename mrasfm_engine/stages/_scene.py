@@ -58,9 +58,7 @@ def pictures(run: Run, result: Scene, scratch: Path) -> PictureFiles:
 
     started = time.perf_counter()
     run.begin(Stage.PICTURES)
-    files, report = draw_pictures(
-        result, scratch=scratch, seed=run.config.seed, threads=run.config.threads, progress=step
-    )
+    files, report = draw_pictures(result, scratch=scratch, seed=run.config.seed, progress=step)
     return_freed_memory()
     seconds = round(time.perf_counter() - started, 3)
     run.report["stages"].append({"stage": Stage.PICTURES, "seconds": seconds, "reused": False, **report})

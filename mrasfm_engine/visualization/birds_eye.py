@@ -58,7 +58,7 @@ class BirdsEye:
 
 
 def birds_eye(
-    scene: Scene, *, seed: int = 0, threads: int = 1, progress: CountProgress | None = None, scratch: Path | None = None
+    scene: Scene, *, seed: int = 0, progress: CountProgress | None = None, scratch: Path | None = None
 ) -> BirdsEye:
     """Draw a scene's road from above, before and after recalibration, and as one picture.
 
@@ -82,7 +82,7 @@ def birds_eye(
     with ExitStack() as stack:
         painters: list[Painter] = [painter]
         if scratch is not None:
-            road = stack.enter_context(painting_road(plan, heights, scratch, own_car_m, threads=threads))
+            road = stack.enter_context(painting_road(plan, heights, scratch, own_car_m))
             optional = OptionalPainter(road, on_error=lambda: discard_road(road, scratch))
             painters.append(optional)
         paint_views(

@@ -22,7 +22,7 @@ Drawn = tuple[Mapping[str, Bytes], Mapping[str, bytes | LargeFile], dict[str, An
 
 
 def draw_pictures(
-    scene: Scene, *, scratch: Path | None = None, seed: int = 0, threads: int = 1, progress: CountProgress | None = None
+    scene: Scene, *, scratch: Path | None = None, seed: int = 0, progress: CountProgress | None = None
 ) -> tuple[dict[str, bytes | LargeFile], dict[str, Any]]:
     """Files by name, and what the report says of them.
 
@@ -39,7 +39,7 @@ def draw_pictures(
     road: dict[str, Any] = {}
 
     def from_above() -> Drawn:
-        drawn = birds_eye(scene, seed=seed, threads=threads, progress=progress, scratch=scratch)
+        drawn = birds_eye(scene, seed=seed, progress=progress, scratch=scratch)
         road.update(drawn.road_report)
         return drawn.pictures, drawn.files, drawn.report
 

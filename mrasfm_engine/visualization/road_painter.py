@@ -7,15 +7,13 @@ may still reach it, then decided, written and forgotten, while the next views ar
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
-from mrasfm_engine.parallel import even_bounds, in_parts
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.mosaic import MIN_CELL_M, RADIUS_M
@@ -26,8 +24,6 @@ from mrasfm_engine.visualization.running_gains import RunningGains
 from mrasfm_engine.visualization.standing_points import StandingPoints
 from mrasfm_engine.visualization.tile_file import TILE_CELLS, TileFile, TileIndex
 from mrasfm_engine.visualization.views import REFINED, VIEW_M, PlacedView, View, place_view
-
-Result = TypeVar("Result")
 
 UNDECIDED_BLOCKS = 8  # that may wait in memory, of 5 MB each
 
@@ -55,8 +51,6 @@ class RoadPainter:
         Takes the finished blocks.
     own_car_m
         See `MosaicPainter`.
-    threads
-        A view is added to several blocks at one time.
     """
 
     views: Sequence[View]
@@ -67,7 +61,6 @@ class RoadPainter:
     tiles: TileFile
     own_car_m: Floats | None
     radius_m: float = RADIUS_M  # beside the trajectory
-    threads: int = 1
     cells: Cells = field(default_factory=Cells)
     images_used: int = 0
 
@@ -110,21 +103,10 @@ class RoadPainter:
 
     def _add(self, shot: Shot, blocks: Sequence[Candidates]) -> None:
         view = shot.view
-        ratios = self._of_each(blocks, lambda block: log_ratios(block, shot, view.gain, MIN_CELL_M, APRON_CELLS))
+        ratios = [log_ratios(block, shot, view.gain, MIN_CELL_M, APRON_CELLS) for block in blocks]
         gain = view.gain * self._gains.factor(view.camera, np.concatenate([np.zeros(0), *ratios]))
-        added = self._of_each(blocks, lambda block: add_view(block, shot, gain, MIN_CELL_M))
-        self.images_used += sum(added) > 0
-
-    def _of_each(self, blocks: Sequence[Candidates], work: Callable[[Candidates], Result]) -> list[Result]:
-        """Results of `work` with each block, in their order; every thread takes a part of the blocks."""
-        parts = self.threads if len(blocks) >= self.threads else 1
-        results: list[list[Result]] = [[] for _ in range(parts)]
-
-        def one(lo: int, hi: int, part: int) -> None:
-            results[part] = [work(block) for block in blocks[lo:hi]]
-
-        in_parts(even_bounds(len(blocks), parts), one)
-        return [result for part in results for result in part]
+        added = sum(add_view(block, shot, gain, MIN_CELL_M) for block in blocks)
+        self.images_used += added > 0
 
     def _finish(self, block: Block) -> None:
         candidates = self._store.pop(block)

@@ -58,9 +58,7 @@ class OptionalPainter:
 
 
 @contextmanager
-def painting_road(
-    plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Floats | None, *, threads: int = 1
-) -> Iterator[RoadPainter]:
+def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Floats | None) -> Iterator[RoadPainter]:
     """A painter of the plan's road, whose tiles are in an empty folder until the context ends."""
     (scratch / BLOCKS).mkdir()
     try:
@@ -73,7 +71,6 @@ def painting_road(
                 folder=scratch / BLOCKS,
                 tiles=tiles,
                 own_car_m=own_car_m,
-                threads=threads,
             )
             with closing(painter):
                 yield painter

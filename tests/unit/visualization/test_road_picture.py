@@ -54,12 +54,7 @@ def shots(
 
 
 def road_painter(
-    views: list[View],
-    folder: Path,
-    *,
-    standing_m: np.ndarray = NOTHING,
-    radius_m: float = 12.0,
-    threads: int = 1,
+    views: list[View], folder: Path, *, standing_m: np.ndarray = NOTHING, radius_m: float = 12.0
 ) -> RoadPainter:
     """A painter whose files are in a folder."""
     (folder / BLOCKS).mkdir(parents=True)
@@ -72,7 +67,6 @@ def road_painter(
         tiles=TileFile(folder / TILES),
         own_car_m=None,
         radius_m=radius_m,
-        threads=threads,
     )
 
 
@@ -84,10 +78,9 @@ def road_of(
     standing_m: np.ndarray = NOTHING,
     radius_m: float = 12.0,
     masks: dict[int, np.ndarray] | None = None,
-    threads: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, RoadPainter]:
     """The finest level (h, w, 4), the places (h, w, 2) that it shows, and the painter."""
-    painter = road_painter(views, folder, standing_m=standing_m, radius_m=radius_m, threads=threads)
+    painter = road_painter(views, folder, standing_m=standing_m, radius_m=radius_m)
     with painter.tiles:
         paint_views(views, lambda i: (images[i], (masks or {}).get(i)), [painter])
         painter.finish()
@@ -133,12 +126,6 @@ def test_every_cell_shows_its_own_place_also_at_the_borders_of_tiles(
     assert step[:, across][both[:, across]].mean() == pytest.approx(step[both].mean(), rel=0.4)
     assert painter.images_used == len(painter.views)
     assert painter.cells.seen > near.sum()
-
-
-def test_several_threads_paint_the_same(tmp_path: Path) -> None:
-    one, several = (road_of(tmp_path / f"{threads}", *shots(gains=(1.0, 0.75)), threads=threads) for threads in (1, 3))
-    np.testing.assert_array_equal(one[0], several[0])
-    assert one[2].images_used == several[2].images_used > 2
 
 
 def test_a_car_that_moved_on_is_outvoted(tmp_path: Path, plain: tuple[np.ndarray, np.ndarray, RoadPainter]) -> None:
