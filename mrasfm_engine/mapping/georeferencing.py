@@ -58,11 +58,13 @@ class GnssAlignment:
 class Refusal:
     """The reason why positions do not fit the reconstruction.
 
-    `is_of_scale` is True where they have its shape at another scale, and nothing else is wrong.
+    `is_of_scale` is True where they have its shape at another scale, and nothing else is wrong. `remedy` is what helps
+    where it is not to check them.
     """
 
     reason: str
     is_of_scale: bool = False
+    remedy: str = ""
 
 
 def align_with_gnss(
@@ -112,7 +114,8 @@ def align_with_gnss(
     if np.sqrt((spread**2).sum()) < MIN_EXTENT_SIGMAS * float(np.median(sigma_m[:, :2])):
         moved_m = 2 * float(spread.max())
         return Refusal(
-            reason=f"the car moved by {moved_m:.1f} m, too little against the receiver's noise to tell directions"
+            reason=f"the car moved by {moved_m:.1f} m, too little against the receiver's noise to tell directions",
+            remedy="Give a longer piece of the drive, or sigmas in gnss.samples that are as small as the errors are.",
         )
     scale_range = _scale_range(sigma_rig_scale)
     start, inlier = _best_yaw(a, measured_m, sigma_m, outlier_sigmas, rng, scale_range)

@@ -227,7 +227,11 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "outliers_at_us": [int(t) for t in times],
             "residual_rms_m": float(np.sqrt((placement.off_m[placement.inlier] ** 2).sum(1).mean())),
             "noise_factor": placement.noise_factor,
-            "errors_in_declared_sigmas": {"white": placement.errors.white, "wander": placement.errors.wander},
+            "errors_in_declared_sigmas": {
+                "white": placement.errors.white,
+                "wander": placement.errors.wander,
+                "unseen": placement.errors.unseen,
+            },
             "wandering_error_rms_m": _wandering_rms_m(mapper, placement),
             "scale_of_rig_against_gnss": placement.scale_of_rig,
             "error_jumps_at_us": [int(t) for t in mapper.drive.timestamps_us[placement.jumps]],
@@ -383,7 +387,7 @@ def _scale_from_gnss(mapper: Mapper, refinement: Refinement) -> str:
             "Give GNSS positions of a longer path, or of a receiver with a smaller error: those of the drive are used"
         )
     if refinement.placement is not None:
-        return "Correct the drive's GNSS positions, which are not used; another finding says why"
+        return "See why the drive's GNSS positions are not used, which another finding says"
     if gnss is not None and gnss.samples:
         return "Use the drive's GNSS positions, which this run was told to ignore"
     return "Give GNSS positions"

@@ -100,7 +100,7 @@ def place_by_gnss(
         alignment = align(known)
     if isinstance(alignment, Refusal):
         reason = alignment.reason + (_left_out(gnss) if len(units) < MIN_POSITIONS else "")
-        return Placement(reason=reason, is_of_another_scale=alignment.is_of_scale)
+        return Placement(reason=reason, is_of_another_scale=alignment.is_of_scale, remedy=alignment.remedy)
     alignment, known = _moved(mapper, gnss, antenna_in_rig_m, alignment, known, align)
     placement = Placement(
         alignment=alignment,

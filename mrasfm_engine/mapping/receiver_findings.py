@@ -35,8 +35,8 @@ def refusal_findings(placement: Placement) -> list[Finding]:
             "are those of the rig, and as wrong as it is."
         )
         return [error("gnss-contradicts-rig", what, remedy)]
-    remedy = "Check gnss.samples: their clock, the order of latitude and longitude, and the stated sigmas."
-    return [warning("gnss-not-used", what, remedy)]
+    usual = "Check gnss.samples: their clock, the order of latitude and longitude, and the stated sigmas."
+    return [warning("gnss-not-used", what, placement.remedy or usual)]
 
 
 def jump_findings(mapper: Mapper, placement: Placement) -> list[Finding]:

@@ -39,11 +39,15 @@ class ReceiverErrors:
         and of what wanders.
     positions_a_sample
         Number of units whose positions are interpolated between the same two samples.
+    unseen
+        Standard deviation that is left of the declared one by how positions scatter, where these are too few to say
+        that anything wanders: all of them may be off by so much together.
     """
 
     white: float = 1.0
     wander: float = 0.0
     positions_a_sample: int = 1
+    unseen: float = 0.0
 
     def is_as_large_as(self, other: ReceiverErrors) -> bool:
         """True where neither differs by more than a factor that a few samples leave open."""
@@ -58,6 +62,7 @@ class Placement:
     prior: ReceiverPositions | None = None
     reason: str = ""
     is_of_another_scale: bool = False  # which is all that the positions contradict
+    remedy: str = ""  # for that reason, where it is not to check the positions
     alignment: GnssAlignment | None = None
     scale_of_rig: float = 1.0  # factor on the rig's lengths as given that makes the scene fit positions best
     known_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (u, 3) positions, NaN where there is none
@@ -74,6 +79,15 @@ class Placement:
     blended: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # units between two samples of a jump
     level_m: Floats = field(default_factory=lambda: np.zeros((1, 3)))  # (k + 1, 3) what each part adds to positions
     findings: list[Finding] = field(default_factory=list)  # what a user should look at
+
+    @property
+    def unseen_m(self) -> Floats:
+        """Standard deviations (3,) of an error that all positions may share, see `ReceiverErrors.unseen`."""
+        units = self.units[self.inlier]
+        if not len(units):
+            return np.zeros(3)
+        result: Floats = self.errors.unseen * np.median(self.known_sigma_m[units], axis=0)
+        return result
 
     @property
     def is_contradicted(self) -> bool:
@@ -182,7 +196,7 @@ def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
 
     The scatter's share of the declared variance is white, and averages out; the rest wanders. Scatter that is not
     clearly less than declared is all of it, and so is one of which nothing is seen: few positions that all wander
-    together would have the way between them exactly.
+    together would have the way between them exactly. What it is less by may be an error of all of them.
     """
     good = placement.inlier
     apart = _units_a_sample(mapper, placement.units[good], placement.interval_us)
@@ -197,12 +211,11 @@ def receiver_errors(mapper: Mapper, placement: Placement) -> ReceiverErrors:
     white = float((np.median(np.abs(steps)) / 0.6745) ** 2) if len(steps) else 1.0
     # A variance from the median of n normal numbers is uncertain by 2.3 / sqrt(n) of itself; neighbouring steps
     # share a sample, which makes n half of them.
+    rest = placement.noise_factor * float(np.sqrt(1.0 - min(white, 1.0)))
     if white > 1.0 - 2.0 * 2.3 / np.sqrt(0.5 * max(len(steps), 1)):
-        white = 1.0
+        return ReceiverErrors(white=placement.noise_factor, positions_a_sample=apart, unseen=rest)
     return ReceiverErrors(
-        white=placement.noise_factor * max(float(np.sqrt(min(white, 1.0))), MIN_WHITE),
-        wander=placement.noise_factor * float(np.sqrt(1.0 - min(white, 1.0))),
-        positions_a_sample=apart,
+        white=placement.noise_factor * max(float(np.sqrt(white)), MIN_WHITE), wander=rest, positions_a_sample=apart
     )
 
 

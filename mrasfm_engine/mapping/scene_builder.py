@@ -54,6 +54,8 @@ def build_scene(
         between = ~mapper.keyframe & mapper.registered
         sigma[between] = sigma[nearest_keyframes(mapper)[between]]
     georeferenced = refinement.georeferenced
+    if georeferenced and refinement.placement is not None:
+        sigma = np.hypot(sigma, refinement.placement.unseen_m)
     patches, judged = np.full(len(mapper.tracks), -1, dtype=np.int32), refinement.road
     if isinstance(judged, RoadAssessment):
         patches[judged.tracks] = judged.patches_of(mapper.state.points_m[judged.tracks])

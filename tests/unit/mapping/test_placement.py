@@ -18,6 +18,8 @@ from mrasfm_engine.mapping.receiver_findings import refusal_findings
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors, most_likely_errors, receiver_errors
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
+from mrasfm_engine.mapping.scene_builder import build_scene
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -143,10 +145,36 @@ def wandering(units: int, rng: np.random.Generator) -> np.ndarray:
 
 def test_white_noise_counts_sample_by_sample() -> None:
     noise = np.random.default_rng(0).normal(size=(200, 3))
-    assert errors(noise) == ReceiverErrors(white=1.0, wander=0.0, positions_a_sample=1)
     # A bend of the scene, however large, is no noise and hides none.
     bent = noise + 20 * np.linspace(0, 1, 200)[:, None] ** 2
-    assert errors(bent) == ReceiverErrors(white=1.0, wander=0.0, positions_a_sample=1)
+    for found in (errors(noise), errors(bent)):
+        assert (found.white, found.wander, found.positions_a_sample) == (1.0, 0.0, 1)
+        assert found.unseen < 0.45  # two standard deviations of how these scatter
+
+
+def test_few_positions_that_scatter_by_less_may_share_an_error() -> None:
+    """Twenty samples do not say that anything wanders, and scatter by two thirds of what the receiver declares."""
+    found = [errors(0.64 * np.random.default_rng(seed).normal(size=(20, 3))) for seed in range(9)]
+    few = [one for one in found if one.wander == 0.0]
+    assert len(few) > 6
+    assert all(one.white == 1.0 for one in few)  # they weigh no less in the adjustment
+    assert np.median([one.unseen for one in few]) == pytest.approx(np.sqrt(1.0 - 0.64**2), rel=0.2)
+
+
+def test_the_scenes_stated_place_holds_an_error_that_all_positions_share() -> None:
+    simulated = make_simulated_drive(units=20, cameras=2, points=400)
+    mapper = with_true_poses(make_model(simulated, true_matches(simulated)), simulated, range(20))
+    shared_m = np.array([0.38, -0.3, 0.4])
+    gnss = replace(received(simulated, 0.32, shared_m), sigma_m=np.full((20, 3), 0.5))
+    result = refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
+    assert result.placement is not None
+    assert result.placement.errors.wander == 0.0
+    known = PriorTrajectory(source="none", world_from_rig=None, gnss=gnss, antenna_in_rig_m=ARM_M)
+    scene = build_scene(mapper, result, simulated.features, true_matches(simulated), known)
+    off_m = scene.world_from_rig[:, :3, 3] - simulated.world_from_rig[:, :3, 3]
+    assert np.abs(off_m.mean(0)).min() > 0.2
+    in_sigmas = off_m / scene.sigma_position_m
+    assert 0.4 < np.sqrt((in_sigmas**2).mean()) < 1.6
 
 
 def test_what_scatters_in_part_wanders_in_part() -> None:
@@ -240,6 +268,14 @@ def test_a_receiver_of_another_route_changes_nothing() -> None:
     assert [(f.severity, f.code) for f in refusal_findings(placement)] == [("warning", "gnss-not-used")]
     assert placement.reason
     np.testing.assert_allclose(mapper.state.unit_position_m, before, atol=1e-9)
+
+
+def test_a_way_that_is_short_against_the_noise_is_no_fault_of_the_positions() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=300)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    (said,) = refusal_findings(place_by_gnss(mapper, received(simulated, 50.0), ARM_M))
+    assert "too little against the receiver's noise" in said.what
+    assert said.remedy.startswith("Give a longer piece of the drive")
 
 
 @pytest.mark.parametrize("start", [0, 3])
