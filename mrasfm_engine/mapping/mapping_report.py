@@ -387,7 +387,7 @@ def _scale_from_gnss(mapper: Mapper, refinement: Refinement) -> str:
             "Give GNSS positions of a longer path, or of a receiver with a smaller error: those of the drive are used"
         )
     if refinement.placement is not None:
-        return "See why the drive's GNSS positions are not used, which another finding says"
+        return "See to the drive's GNSS positions, which are not used; another finding says why"
     if gnss is not None and gnss.samples:
         return "Use the drive's GNSS positions, which this run was told to ignore"
     return "Give GNSS positions"
