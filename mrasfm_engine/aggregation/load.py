@@ -21,11 +21,12 @@ from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from schemas import Camera, DriveManifest, Pose
 from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, component_folder, component_scene
+from schemas.gnss_check import MAX_SPEED_MPS
 
 SCHEMA_VERSION = 1
 MIN_UNITS = 2
 POSES_APART = 1e-3  # of two files, at most: metres, and a rotation's entries
-MAX_SPEED_M_S, FROM_UNIT_M = 100.0, 0.5  # of images, at most, from their unit: by their times, and besides
+FROM_UNIT_M = 0.5  # of images, at most, from their unit, besides what is driven between their times
 NUMBER = re.compile(r"[1-9][0-9]{0,8}")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,99}")
 NEEDED = (
@@ -324,7 +325,7 @@ def _require_images_at_units(scene: SourceScene, calibration: Mapping[str, Any])
         for image in scene.drive.images
     ]
     away_m = np.linalg.norm(scene.unit_from_image[:, :3, 3], axis=1)
-    excess_m = away_m - (FROM_UNIT_M + MAX_SPEED_M_S * np.array(apart_us) / 1e6)
+    excess_m = away_m - (FROM_UNIT_M + MAX_SPEED_MPS * np.array(apart_us) / 1e6)
     worst = int(np.argmax(excess_m))
     if not excess_m[worst] <= 0.0:
         raise ValueError(

@@ -157,7 +157,7 @@ def _lock_stages(stages: Path, stack: ExitStack) -> None:
             descriptor = os.open(stages, os.O_RDONLY | os.O_DIRECTORY)
         except OSError as error:
             # A run that ends has just removed it; or none can be made there, as in a folder that was deleted.
-            removed += isinstance(error, FileNotFoundError)
+            removed += 1
             if isinstance(error, FileNotFoundError) and removed < MOST_REMOVED:
                 continue
             raise storage_error(stages, error) from error

@@ -36,8 +36,7 @@ def notes_of_unread_files(unread: Mapping[str, Sequence[str]]) -> list[str]:
     unread
         Names, as `unread_files` finds them, by what the note calls their folder.
     """
-    shown = {folder: listed([*map(_short, names)], MAX_NAMES) for folder, names in unread.items() if names}
-    parts = [f"{_short(folder)}: {len(unread[folder])} ({names})" for folder, names in shown.items()]
+    parts = _counted(unread)
     return (
         [f"Files that are not read, as images are .png, .jpg or .jpeg: {enumerated(parts, MAX_FOLDERS)}."]
         if parts
@@ -69,11 +68,7 @@ def notes_of_masks_without_a_frame(numbers: Mapping[str, Sequence[int]]) -> list
     numbers
         Numbers of such frames by camera.
     """
-    parts = [
-        f"{_short(camera)}: {len(own)} ({listed([*map(str, own)], MAX_NAMES)})"
-        for camera, own in numbers.items()
-        if own
-    ]
+    parts = _counted({camera: [*map(str, own)] for camera, own in numbers.items()})
     return [f"Masks of frames that have no images, left out: {enumerated(parts, MAX_FOLDERS)}."] if parts else []
 
 
@@ -81,6 +76,11 @@ def notes_of_images_without_a_camera(paths: Sequence[str]) -> list[str]:
     """A note that counts and names the images that begin with no camera's prefix; none where there are none."""
     names = listed([*map(_short, paths)], MAX_NAMES)
     return [f"Images that begin with no camera's image_prefix, left out: {len(paths)} ({names})."] if paths else []
+
+
+def _counted(names: Mapping[str, Sequence[str]]) -> list[str]:
+    """Words that count and name what is left out of a folder or camera each; none of those with nothing."""
+    return [f"{_short(of)}: {len(own)} ({listed([*map(_short, own)], MAX_NAMES)})" for of, own in names.items() if own]
 
 
 def _short(name: str) -> str:
