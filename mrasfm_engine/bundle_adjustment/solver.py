@@ -54,6 +54,10 @@ class SolverOptions:
     # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that move
     # between their robust weights, which moves no pose.
     decrement_tolerance: float = 5e-3
+    # Whether what the last two steps let expect of all further ones may be as small, instead of the last step itself.
+    # Along a flat direction it goes on for longer than these show: only where further adjustments follow, and of many
+    # units.
+    expects_rest: bool = False
     initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
     sigma_px: float = 1.0  # standard deviation of an observation
@@ -365,6 +369,18 @@ class _Direction:
         return 1.0 / (1.0 - min(along / self.decrement, MAX_RATE))
 
 
+def _decrement_left(before: float, decrement: float) -> float:
+    """Decrement that is left after a step, from those of the step before and of itself.
+
+    The steps that follow go on shrinking as these two do. It is at most that of the step itself, as a rule by which
+    more slowly shrinking ones end as well.
+    """
+    if not 0.0 < decrement < before:
+        return decrement
+    rate = math.sqrt(decrement / before)
+    return decrement * min(rate / (1.0 - rate), 1.0) ** 2
+
+
 def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     options, state = problem.options, problem.state
     costs = problem.point_costs(state)
@@ -375,6 +391,7 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
     before: _Direction | None = None
+    as_it_is = 0.0  # decrement of the step before, where neither a factor nor damping changed its length
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
@@ -382,6 +399,7 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         system = problem.normal_equations(state, damping)
         step = problem.step(state, system, damping)
         decrement = 0.0 if step is None else -float(step @ system.gradient)
+        left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
         if step is not None:
             factor = 1.0
             if before is not None and damping <= MAX_DAMPING_OF_DECREMENT:
@@ -392,18 +410,19 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 factor = 1.0
                 trial, trial_costs, trial_cost = problem.after(state, costs, system, step)
         if step is None or not trial_cost < cost:
-            before = None
+            before, as_it_is = None, 0.0
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
             elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
+        as_it_is = decrement if factor == 1.0 and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
         # A lengthened step may end as high on the other side of the minimum.
         is_flat = factor == 1.0 and cost - trial_cost <= options.function_tolerance * cost
         if is_flat or (
             # A step that damping holds back is short wherever the minimum is.
-            free and damping <= MAX_DAMPING_OF_DECREMENT and decrement <= options.decrement_tolerance
+            free and damping <= MAX_DAMPING_OF_DECREMENT and left <= options.decrement_tolerance
         ):
             termination = Termination.CONVERGED
         state, cost, costs = trial, trial_cost, trial_costs

@@ -15,6 +15,7 @@ from mrasfm_engine.mapping.baseline_without_rig import register_images_singly, r
 from mrasfm_engine.mapping.calibration import (
     assess_calibration,
     calibration_prior,
+    has_few_units,
     resolve_scale,
     scale_of_baselines,
     scale_with_baselines,
@@ -291,6 +292,7 @@ def _adjust_locally(mapper: Mapper, unit: int, absolute: AbsolutePriors) -> None
             max_iterations=10,
             function_tolerance=LOCAL_TOLERANCE,
             decrement_tolerance=DECREMENT_TOLERANCE,
+            expects_rest=not has_few_units(mapper),
             loss_scale=mapper.config.bundle_adjustment.loss_scale,
             threads=mapper.config.threads,
         ),
@@ -311,6 +313,7 @@ def adjust_globally(mapper: Mapper, log: MappingLog, cancel: Cancel | None) -> N
         max_iterations=20,
         function_tolerance=GLOBAL_TOLERANCE,
         decrement_tolerance=DECREMENT_TOLERANCE,
+        expects_rest=not has_few_units(mapper),
         loss_scale=mapper.config.bundle_adjustment.loss_scale,
         threads=mapper.config.threads,
     )

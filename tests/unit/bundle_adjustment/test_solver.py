@@ -110,6 +110,32 @@ def test_a_lengthened_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest
     np.testing.assert_array_equal(solution.unit_position_m, plain.unit_position_m)
 
 
+@pytest.mark.parametrize("rate", [0.1, 0.45])
+def test_what_is_left_after_a_step_is_the_rest_of_its_series(rate: float) -> None:
+    steps = rate ** np.arange(60)
+    np.testing.assert_allclose(solver._decrement_left(1.0, rate**2), steps[2:].sum() ** 2)
+    # Steps that hardly shrink end by their own length.
+    assert solver._decrement_left(1.0, 0.9) == solver._decrement_left(0.0, 0.9) == 0.9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_adjustment_ends_as_soon_as_little_is_left(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(solver, "COSINES", (2.0, 3.0))  # a lengthened step tells nothing of the next one
+    case = drive(noise_px=0.5, seed=seed)
+    start = perturbed(case.truth, np.random.default_rng(seed), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
+    options = SolverOptions(function_tolerance=0.0, decrement_tolerance=0.1, expects_rest=True, sigma_px=0.5)
+    problem = replace(case.problem, state=start, options=options)
+    solution, report = solve(problem)
+    assert report.termination is Termination.CONVERGED
+    system = problem.normal_equations(solution, 0.0)
+    further = problem.step(solution, system, 0.0)
+    assert further is not None
+    assert 0.0 < -float(further @ system.gradient) < options.decrement_tolerance
+    monkeypatch.setattr(solver, "_decrement_left", lambda before, decrement: decrement)
+    _, by_the_last_step = solve(problem)
+    assert report.iterations < by_the_last_step.iterations
+
+
 @pytest.mark.parametrize("outlier_fraction", [0.0, 0.1])
 @pytest.mark.parametrize("seed", range(2))
 def test_poses_and_points_are_recovered_from_noise_and_outliers(seed: int, outlier_fraction: float) -> None:
