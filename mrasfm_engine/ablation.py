@@ -18,9 +18,12 @@ from mrasfm_engine.evaluation.trajectory import MIN_POSES, match_timestamps
 from mrasfm_engine.io.stage_store import Arrays, StageStore, StoredStage
 from mrasfm_engine.io.trajectory_file import Trajectory
 from mrasfm_engine.mapping import components
-from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import Floats
@@ -243,15 +246,21 @@ def _row(
 def warm_up(
     run: stages.Run, features: Sequence[ImageFeatures], matches: Sequence[PairMatches], prior: PriorTrajectory
 ) -> None:
-    """Map the first units, so that no row's time has the loading of compiled code in it."""
+    """Map and refine the first units, so that no row's time has the loading of compiled code in it."""
     few = Drive(
         run.drive.root, run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:WARM_UP_UNITS]})
     )
     images = len(few.images)
-    poses = None if prior.world_from_rig is None else prior.world_from_rig[:WARM_UP_UNITS]
-    keypoints, pairs = Keypoints.from_matches(few, features[:images], [p for p in matches if p.image_b < images])
+    bands = RowBands.from_drive(few, compensate=run.config.mapping.motion_compensation)
+    sound = [pair for pair in matches if pair.image_b < images]
+    keypoints, pairs = Keypoints.from_matches(few, features[:images], sound, bands)
+    known = prior_trajectory(few, run.config.gnss, use_gnss=prior.gnss is not None)
+    absolute = AbsolutePriors.from_trajectory(known)
     try:
-        components.map_drive(few, keypoints, pairs, poses, run.config, cancel=run.cancel)
+        mapped = components.map_drive(
+            few, keypoints, pairs, known.world_from_rig, run.config, absolute=absolute, cancel=run.cancel
+        )
+        refine(mapped[0].mapper, AbsolutePriors.from_trajectory(known), cancel=run.cancel)
     except CancelledError:
         raise
     except ReconstructionError:

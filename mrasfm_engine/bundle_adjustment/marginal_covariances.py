@@ -90,6 +90,12 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
     return replace(result.with_scale_error(np.sqrt(max(more, 0.0))), sigma_scale=found.sigma_scale)
 
 
+def sigma_factor_of_shared_errors(problem: Problem, state: State) -> float:
+    """The `sigma_factor` of `covariances` alone, for half of its time; one where there is too little to tell."""
+    found = _shared_errors(problem, state)
+    return 1.0 if found is None else found.sigma_factor
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Marginals:
     units: Floats  # (free units, 6) variances
@@ -119,7 +125,7 @@ def _regular_marginals(
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
     of_independent = joint[-1, -1]
-    found = _shared_errors(problem, state, unseen) if shared_errors else None
+    found = _shared_errors(problem, state) if shared_errors else None
     joint = (joint if found is None else found.covariance) + of_readouts
     loose = eliminated.free[unseen[split:][eliminated.free]]
     covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
@@ -143,13 +149,14 @@ def _regular_marginals(
     )
 
 
-def _shared_errors(problem: Problem, state: State, unseen: Bools) -> SharedErrors | None:
+def _shared_errors(problem: Problem, state: State) -> SharedErrors | None:
     """Errors that observations share, by the cameras' unknowns and the scale: covariances are (f + 1, f + 1).
 
     None where they are too few to tell, or do not determine all by the curvature of their loss.
     """
     curved = problem.with_curvature()
     system = curved.normal_equations(state, 0.0)
+    unseen = system.matrix_diagonal() == 0.0  # below zero, the loss bends the other way: there is no factor
     eliminated = system.eliminate(unseen.astype(np.float64))
     if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
         return None

@@ -124,7 +124,8 @@ def choose_points(observations: Observations, free_units: Bools, image_size_px: 
     bucket = ((slot * len(image_size_px) + o.camera) * rows + place[:, 1]) * columns + place[:, 0]
     cells = int(free_units.sum()) * len(image_size_px) * rows * columns
     wanted = np.full(cells, -(-an_image // (rows * columns)), dtype=np.int64)
-    length = np.diff(o.first_of_point)
+    # numpy sorts integers of 16 bits by their digits, in a tenth of the time.
+    length = np.minimum(np.diff(o.first_of_point), np.iinfo(np.int16).max).astype(np.int16)
     result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, bucket, wanted)
     return result
 

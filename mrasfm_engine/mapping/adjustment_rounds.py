@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mrasfm_engine.bundle_adjustment.marginal_covariances import sigma_factor_of_shared_errors
 from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.errors import ReconstructionError
@@ -21,7 +22,7 @@ from mrasfm_engine.mapping.refinement_result import (
     DECREMENT_TOLERANCE,
     ROUGH_DECREMENT_TOLERANCE,
     Refinement,
-    certainty_of,
+    problem_of_all_unknowns,
     solver_options,
     terms_of,
 )
@@ -78,10 +79,10 @@ def weigh_shared_errors(mapper: Mapper, result: Refinement) -> None:
     """
     if not result.recalibrated.any():
         return
-    certainty = certainty_of(mapper, result)
-    if certainty is None:
+    problem = problem_of_all_unknowns(mapper, result)
+    if problem is None:
         return
-    result.sigma_factor = certainty.sigma_factor
+    result.sigma_factor = sigma_factor_of_shared_errors(problem, problem.state)
     if result.given_scale is not None:
         result.given_scale = replace(result.given_scale, sigma=result.given_scale.sigma * result.sigma_factor)
 

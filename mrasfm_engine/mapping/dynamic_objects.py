@@ -150,8 +150,8 @@ def _vote(a: Any, b: Any, least_px: Any, moved_px: Any, along: Any, seen: Any, m
 def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:
     """Least motion of points (n,) of a static world from image a to image b, at whatever depth they are.
 
-    `up` (3,) is the rig's up direction in camera axes: it bounds the depth of rays that point down. Infinite where a
-    point of the world could not be in front of camera b.
+    One of at most `MIN_FLOW_PX` is not followed down to the least. `up` (3,) is the rig's up direction in camera axes:
+    it bounds the depth of rays that point down. Infinite where a point of the world could not be in front of camera b.
     """
     falling = -(rays @ up) - MAX_GRADE
     deepest = np.where(
@@ -167,7 +167,8 @@ def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats,
 def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
     """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
 
-    The way is followed in straight steps between DEPTHS knots; those that the camera does not show are left out.
+    The way is followed in straight steps between DEPTHS knots, until it is as near as `MIN_FLOW_PX`; those knots that
+    the camera does not show are left out.
     """
     _follow_paths(kind, params, rays, origin, deepest, xy_px, out, np.empty(6), np.empty(8))
 
@@ -194,5 +195,7 @@ def _follow_paths(
                 at = -(u0 * du + v0 * dv) / max(du * du + dv * dv, 1e-12)
                 if 0.0 < at < 1.0:
                     best = min(best, (u0 + at * du) ** 2 + (v0 + at * dv) ** 2)
+            if best <= MIN_FLOW_PX * MIN_FLOW_PX:
+                break
             u0, v0, before = u, v, True
         out[i] = math.sqrt(best)

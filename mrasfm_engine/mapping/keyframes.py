@@ -47,7 +47,7 @@ def _displacement_px(mapper: Mapper, before: int, now: int) -> float:
     rows = [mapper.rows_of_unit[unit] for unit in (before, now)]
     cameras = len(mapper.camera_kind)
     keys = [mapper.tracks.of_keypoint[r] * cameras + mapper.keypoints.camera[r] for r in rows]
-    _, a, b = np.intersect1d(keys[0], keys[1], return_indices=True)
+    _, a, b = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
     way_px = np.linalg.norm(mapper.keypoints.xy_px[rows[1][b]] - mapper.keypoints.xy_px[rows[0][a]], axis=1)
     camera = mapper.keypoints.camera[rows[0][a]]
     enough = np.flatnonzero(np.bincount(camera, minlength=cameras) >= MIN_COMMON)

@@ -296,8 +296,9 @@ class Mapper:
         fits = errors < self.triangulator.max_error_px
         self.is_inlier[rows[has_point]] = fits
         # Also points that the new view contradicts: with it, another hypothesis may win.
-        again = np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
-        self.triangulate(again[~self.rejected[again]])
+        again = np.zeros(len(self.tracks), dtype=np.bool_)
+        again[tracks[~has_point]] = again[tracks[has_point][~fits]] = True
+        self.triangulate(np.flatnonzero(again & ~self.rejected))
 
     def complete(self) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point."""
@@ -337,7 +338,7 @@ class Mapper:
         self.is_inlier[rows[bad]] = False
         left = np.bincount(tracks[~bad], minlength=len(self.tracks))
         lost = self.triangulated & (left < 2)
-        reduced = np.unique(tracks[bad])
+        reduced = np.flatnonzero(np.bincount(tracks[bad], minlength=len(self.tracks)))
         lost[reduced[~self.triangulator.has_angle(self.state, self.tracks, self.is_inlier, reduced)]] = True
         self.triangulated[lost] = False
         alone = np.flatnonzero(self.is_inlier)

@@ -14,7 +14,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import Report, SolverOptions
+from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import CalibrationDecision, calibration_prior, of_cameras_alone
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, intrinsics_prior
@@ -160,6 +160,14 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
 
     None where they would not be those of what was adjusted, and where there is too much for an inverse.
     """
+    problem = problem_of_all_unknowns(mapper, result)
+    if problem is None:
+        return None
+    return _with_lens_errors(result, of_cameras_alone(mapper, covariances(problem, problem.state)))
+
+
+def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | None:
+    """The adjustment whose inverse says how certain everything is; None as for `certainty_of`."""
     if not (mapper.config.bundle_adjustment.priors and mapper.config.bundle_adjustment.camera_set_adjustment):
         return None
     several, terms = not mapper.drive.has_single_camera, terms_of_all_cameras(mapper, result)
@@ -181,9 +189,7 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
         terms=terms,
         options=solver_options(mapper, result),
     )
-    if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
-        return None
-    return _with_lens_errors(result, of_cameras_alone(mapper, covariances(problem, problem.state)))
+    return None if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE else problem
 
 
 def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Covariances | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ SIGMAS_PX = (32.0, 8.0, 2.0)  # of the Cauchy loss, one after the other, where n
 UNWEIGHTED_PX = 1e6  # of the Cauchy loss: beyond every error
 STEPS = 6  # with each, at most
 SMALL = 1e-5  # a step (rad, m) below this has arrived
+NEAR = 0.1  # of the next loss' sigma: one that moves observations by less leads near enough for it
 
 
 def resect(
@@ -48,7 +50,7 @@ def resect(
     rotation, position = world_from_rig[:3, :3].copy(), world_from_rig[:3, 3].copy()
     views = np.ascontiguousarray(rig_from_view[:, :3, :3]), np.ascontiguousarray(rig_from_view[:, :3, 3])
     square, gradient = np.empty((6, 6)), np.empty(6)
-    for sigma_px in sigmas_px:
+    for sigma_px, next_px in pairwise((*sigmas_px, 0.0)):
         for _ in range(STEPS):
             _pose_system(
                 rotation, position, *views, view_kind, view_params, view, xy_px, points_m, sigma_px, square, gradient
@@ -60,7 +62,8 @@ def resect(
             if not np.isfinite(step).all():
                 return None
             rotation, position = se3.exp_so3(step[:3]) @ rotation, position + step[3:]
-            if np.abs(step).max() < SMALL:
+            moved_px = sigma_px * math.sqrt(max(-float(step @ gradient), 0.0) / len(view))
+            if moved_px < NEAR * next_px or np.abs(step).max() < SMALL:
                 break
     return se3.transform(rotation, position)
 

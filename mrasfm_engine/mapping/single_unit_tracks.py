@@ -13,6 +13,7 @@ front of a vehicle looks so different a metre later that few of its points go on
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,6 +21,7 @@ from scipy.special import betaln, expit, logit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.jit import njit
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.triangulation.track_motion import GroundPath
@@ -37,10 +39,9 @@ LEAST_CORRELATION = 0.01  # of points in one neighbourhood
 
 @dataclass(frozen=True, kw_only=True)
 class _Shares:
-    """Neighbourhoods of points in units of which two cameras observe them."""
+    """Neighbourhoods of points that can be judged, in units of which two cameras observe them."""
 
     track: Ints  # (n,)
-    unit: Ints  # (n,)
     neighbours: Ints  # (n,)
     going_on: Ints  # (n,) of the neighbours, those that other units observe as well
 
@@ -51,10 +52,8 @@ def log_odds_in_single_units(mapper: Mapper, moves: Bools, path: GroundPath) -> 
     `moves` (tracks,) are known to move, and are no neighbours.
     """
     result = np.full(len(mapper.tracks), np.nan)
-    shares, single = _neighbourhoods(mapper, moves)
+    shares, single = _neighbourhoods(mapper, moves, path)
     rows = np.flatnonzero(shares.neighbours > 0)
-    rows = rows[_off_the_ground(mapper.state.points_m[shares.track[rows]], path)]
-    rows = rows[_seen_by_next(mapper, mapper.state.points_m[shares.track[rows]], shares.unit[rows])]
     # The track itself is one more of its neighbourhood.
     alone = single[shares.track[rows]]
     count, going_on = shares.neighbours[rows] + 1, shares.going_on[rows] + ~alone
@@ -115,7 +114,7 @@ def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
     return result
 
 
-def _neighbourhoods(mapper: Mapper, moves: Bools) -> tuple[_Shares, Bools]:
+def _neighbourhoods(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[_Shares, Bools]:
     """Neighbourhoods, and which tracks (tracks,) one unit alone observes."""
     tracks, units = len(mapper.tracks), len(mapper.registered)
     rows = np.flatnonzero(mapper.is_inlier)
@@ -126,29 +125,58 @@ def _neighbourhoods(mapper: Mapper, moves: Bools) -> tuple[_Shares, Bools]:
     )  # by unit, and there by track
     unit, track = np.divmod(seen, tracks)
     single = np.bincount(track, minlength=tracks) == 1
+    points_m, goes_on = mapper.state.points_m[track], ~single[track]
+    asked = np.flatnonzero(images > 1)
+    asked = asked[_off_the_ground(points_m[asked], path)]
+    asked = asked[_seen_by_next(mapper, points_m[asked], unit[asked])]
     begins = np.searchsorted(unit, np.arange(units + 1))
+    first = np.searchsorted(unit[asked], np.arange(units + 1))
 
-    def of_unit(u: int) -> tuple[Ints, Ints, Ints, Ints]:
+    def of_unit(u: int) -> tuple[Ints, Ints]:
         here = slice(begins[u], begins[u + 1])
-        asked = np.flatnonzero(images[here] > 1)
-        around = _around(mapper.state.points_m[track[here]], ~single[track[here]], asked)
-        return track[here][asked], unit[here][asked], *around
+        return _around(points_m[here], goes_on[here], asked[first[u] : first[u + 1]] - begins[u])
 
     found = mapped(mapper.config.threads, of_unit, range(units))
-    columns = [np.concatenate(each) for each in zip(*found, strict=True)]
-    return _Shares(track=columns[0], unit=columns[1], neighbours=columns[2], going_on=columns[3]), single
+    neighbours, going_on = (np.concatenate(each) for each in zip(*found, strict=True))
+    return _Shares(track=track[asked], neighbours=neighbours, going_on=going_on), single
 
 
 def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
     """Neighbours and those of them that go on, around the points `asked` (n,) of all points (m, 3) of a unit."""
-    if not len(asked):
-        return asked, asked
-    count = min(NEIGHBOURS + 1, len(points_m))
-    _, index = cKDTree(points_m).query(points_m[asked], k=count, distance_upper_bound=REACH_M)
-    index = np.asarray(index, dtype=np.int64).reshape(len(asked), count)
-    is_other = (index < len(points_m)) & (index != asked[:, None])
-    going_on = is_other & np.append(goes_on, False)[index]
-    return is_other.sum(axis=1), going_on.sum(axis=1)
+    result = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
+    if len(asked):
+        axis = int(np.ptp(points_m, axis=0).argmax())
+        order = np.argsort(points_m[:, axis])
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        _count_around(points_m.take(order, axis=0), axis, goes_on.take(order), place.take(asked), *result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _count_around(points: Any, axis: int, goes_on: Any, asked: Any, neighbours: Any, going_on: Any) -> None:
+    """Count around points (n,) the nearest of points (m, 3), which are in the order of a coordinate."""
+    distance, goes = np.empty(NEIGHBOURS), np.empty(NEIGHBOURS, np.bool_)
+    for n in range(len(asked)):
+        own, count, limit = asked[n], 0, REACH_M * REACH_M
+        for step in (-1, 1):
+            m = own + step
+            while 0 <= m < len(points) and (points[m, axis] - points[own, axis]) ** 2 < limit:
+                d2 = 0.0
+                for j in range(3):
+                    d2 += (points[m, j] - points[own, j]) ** 2
+                if d2 < limit:
+                    count = min(count + 1, NEIGHBOURS)
+                    at = count - 1
+                    while at > 0 and distance[at - 1] > d2:
+                        distance[at], goes[at] = distance[at - 1], goes[at - 1]
+                        at -= 1
+                    distance[at], goes[at] = d2, goes_on[m]
+                    limit = distance[-1] if count == NEIGHBOURS else limit
+                m += step
+        neighbours[n] = count
+        for i in range(count):
+            going_on[n] += goes[i]
 
 
 def _distribution(count: Ints, going_on: Ints, weight: Floats) -> tuple[float, float]:

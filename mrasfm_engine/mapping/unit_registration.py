@@ -231,14 +231,14 @@ def failed(unit: int, matched: Correspondences2D3D, inliers: int, reason: str) -
 def correspondences_of_unit(mapper: Mapper, unit: int) -> Correspondences2D3D:
     """Keypoints of a unit whose tracks have a point, and these points."""
     rows = mapper.rows_of_unit[unit]
-    tracks = mapper.tracks.of_keypoint[rows]
-    known = mapper.triangulated[tracks]
-    rows, tracks = rows[known], tracks[known]
+    tracks = mapper.tracks.of_keypoint.take(rows)
+    known = np.flatnonzero(mapper.triangulated.take(tracks))
+    rows, tracks = rows.take(known), tracks.take(known)
     return Correspondences2D3D(
-        xy_px=mapper.keypoints.xy_px[rows],
-        points_m=mapper.state.points_m[tracks],
-        camera=mapper.keypoints.camera[rows],
-        band=mapper.keypoints.band[rows],
+        xy_px=mapper.keypoints.xy_px.take(rows, axis=0),
+        points_m=mapper.state.points_m.take(tracks, axis=0),
+        camera=mapper.keypoints.camera.take(rows),
+        band=mapper.keypoints.band.take(rows),
     )
 
 

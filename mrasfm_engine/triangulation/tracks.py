@@ -134,20 +134,21 @@ class Tracks:
     @staticmethod
     def from_labels(of_keypoint: Ints) -> Tracks:
         """Tracks of the keypoints' labels, -1 for none; labels with gaps are numbered anew."""
-        members = np.flatnonzero(of_keypoint >= 0)
-        given = of_keypoint[members]
-        _, labels = np.unique(given, return_inverse=True)
-        result = of_keypoint
-        if not np.array_equal(labels, given):
+        is_member = of_keypoint >= 0
+        members = np.flatnonzero(is_member)
+        given = of_keypoint.take(members)
+        sizes = np.bincount(given)  # labels are numbers of keypoints or less: counting sorts them
+        if (sizes > 0).all():
+            result, labels = of_keypoint, given
+        else:
+            labels = (np.cumsum(sizes > 0) - 1).take(given)
             result = np.full(len(of_keypoint), -1, dtype=np.int64)
-            result[members] = labels
-        order = np.argsort(labels, kind="stable")
-        count = int(labels.max()) + 1 if len(labels) else 0
-        return Tracks(
-            of_keypoint=result,
-            first=np.searchsorted(labels[order], np.arange(count + 1)).astype(np.int64),
-            keypoints=members[order].astype(np.int64),
-        )
+            result[is_member] = labels
+            sizes = sizes[sizes > 0]
+        first = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        keypoints = np.empty(len(members), dtype=np.int64)
+        _put_by_label(members, labels, first[:-1].copy(), keypoints)
+        return Tracks(of_keypoint=result, first=first, keypoints=keypoints)
 
     def classes(self, of_keypoints: Bytes) -> Bytes:
         """The semantic class (tracks,) of most keypoints of every track, given the keypoints' classes (n,)."""
@@ -167,6 +168,14 @@ def inlier_members(tracks: Tracks, which: Ints, is_inlier: Bools) -> Ints:
 def count_members(tracks: Tracks, which: Ints, more: Bools, unit: Ints, counts: Ints) -> None:
     """Count the keypoints of some tracks by their unit (keypoints,): in where `more` (tracks,), out where not."""
     _count_members(tracks.first, tracks.keypoints, which, more, unit, counts)
+
+
+@njit(cache=True, nogil=True)
+def _put_by_label(members: Any, labels: Any, following: Any, out: Any) -> None:
+    """Members (n,) in the order of their labels, and of one label in their own; `following` is where each begins."""
+    for n in range(len(members)):
+        out[following[labels[n]]] = members[n]
+        following[labels[n]] += 1
 
 
 @njit(cache=True, nogil=True)

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment import shared_errors
-from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
+from mrasfm_engine.bundle_adjustment.marginal_covariances import (
+    Covariances,
+    covariances,
+    sigma_factor_of_shared_errors,
+)
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, solve
 from mrasfm_engine.geometry import se3
@@ -118,7 +122,7 @@ def test_priors_that_know_more_are_not_overruled() -> None:
         solution = solve(problem)[0]
         before.append(rotation_error(truth, problem, solution))
         factor = covariances(problem, solution).sigma_factor
-        assert factor > 2.0
+        assert factor == sigma_factor_of_shared_errors(problem, solution) > 2.0
         lighter = replace(problem.options, sigma_px=factor * NOISE_PX, loss_scale=NO_LOSS / factor)
         after.append(rotation_error(truth, problem, solve(replace(problem, options=lighter))[0]))
     assert np.sqrt(np.mean(np.square(after))) < 0.8 * np.sqrt(np.mean(np.square(before)))

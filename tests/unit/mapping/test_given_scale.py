@@ -114,7 +114,7 @@ def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share
     simulated = drive(1)
     mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(UNITS))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adjustment_rounds, "certainty_of", lambda *_: None)
+        patch.setattr(adjustment_rounds, "problem_of_all_unknowns", lambda *_: None)
         unweighed = refined(simulated)[1]
     assert unweighed.sigma_factor == 1.0
     result = refine(mapper)

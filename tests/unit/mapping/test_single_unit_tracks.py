@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.stats import betabinom
 
+from mrasfm_engine.mapping import single_unit_tracks
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.motion_groups import BESIDE
@@ -118,3 +120,20 @@ def test_the_road_in_front_of_the_vehicle_stays_though_few_of_its_points_go_on()
     shown = shown_points(mapper, simulated)
     assert (mapper.triangulated & on_ground[shown]).sum() > 100
     assert not on_ground[shown[found_in(mapper)]].any()
+
+
+@pytest.mark.parametrize("points", [1, 5, 400])
+def test_neighbours_are_the_nearest_within_reach(points: int) -> None:
+    rng = np.random.default_rng(points)
+    points_m = rng.normal(size=(points, 3)) * [2.0, 6.0, 1.0]
+    goes_on = rng.random(points) < 0.5
+    asked = np.flatnonzero(rng.random(points) < 0.7)
+    neighbours, going_on = single_unit_tracks._around(points_m, goes_on, asked)
+    tree = cKDTree(points_m)
+    for row, own in enumerate(asked):
+        inside = [m for m in tree.query_ball_point(points_m[own], single_unit_tracks.REACH_M) if m != own]
+        inside.sort(key=lambda m: float(np.linalg.norm(points_m[m] - points_m[own])))
+        nearest = inside[: single_unit_tracks.NEIGHBOURS]
+        assert neighbours[row] == len(nearest)
+        assert going_on[row] == goes_on[nearest].sum()
+    assert len(asked) < 100 or 0 < (neighbours == single_unit_tracks.NEIGHBOURS).sum() < len(asked)
