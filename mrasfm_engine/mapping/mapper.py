@@ -301,14 +301,19 @@ class Mapper:
         self.triangulate(np.flatnonzero(again & ~self.rejected))
 
     def complete(self) -> None:
-        """Let every point have the observations that now fit it, and try again for tracks without a point."""
+        """Let every point have the observations that now fit it, and try again for tracks without a point.
+
+        One that fewer than two fit is sought anew: poses may have moved further than it could follow.
+        """
         of_keypoint = self.tracks.of_keypoint
         rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
         rows = rows[~self.missing[self.keypoints.image[rows]]]
         rows = rows[self.triangulated[of_keypoint[rows]]]
         errors = self.triangulator.errors_px(self.state, rows, self.state.points_m, of_keypoint[rows])
+        fits = errors < self.triangulator.max_error_px
         self.is_inlier[:] = False
-        self.is_inlier[rows] = errors < self.triangulator.max_error_px
+        self.is_inlier[rows] = fits
+        self.triangulated &= np.bincount(of_keypoint[rows[fits]], minlength=len(self.tracks)) >= 2
         self.rejected[:] = False
         self.triangulate(np.flatnonzero(~self.triangulated))
         self.filter(self.triangulator.max_error_px)
