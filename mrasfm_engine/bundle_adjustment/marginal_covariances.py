@@ -45,6 +45,20 @@ class Covariances:
             sigma_unit_position_m=np.hypot(self.sigma_unit_position_m, sigma * self.by_scale_m),
         )
 
+    def with_calibration_error(self, functional: Floats, sigma: float) -> Covariances:
+        """The same with an error more of a functional (6 c,) of the cameras' poses, all of which move as it lets them.
+
+        That is by their regression on it, as the adjustment weighs errors.
+        """
+        moved = self.calibration_of_independent_errors @ functional
+        variance = float(functional @ moved)
+        if not (np.isfinite(variance) and variance > 0.0):
+            return self
+        moved = moved * (sigma / variance)
+        sigma_camera = self.sigma_camera.copy()
+        sigma_camera[:, :6] = np.hypot(sigma_camera[:, :6], moved.reshape(-1, 6))
+        return replace(self, calibration=self.calibration + np.outer(moved, moved), sigma_camera=sigma_camera)
+
 
 def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -> Covariances:
     """Marginals at a solution, from the inverse of the reduced normal equations (Gauss-Newton, robust weights).

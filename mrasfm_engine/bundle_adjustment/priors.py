@@ -295,10 +295,17 @@ class ScalePrior:
     log_scale: float  # that they should come to: 0 with the rotations as given
     sigma: float
     sigma_scale: float  # of the scale, by both these rotations and lens models
+    sigma_of_corrections: float  # of what the corrections come to, by these rotations alone
 
     def log_scale_of(self, state: State) -> float:
         """Logarithm of the scale that the corrections come to."""
         return self._log_scale_and_turns(state)[0]
+
+    def by_steps(self, state: State) -> Floats:
+        """Derivatives (c, 3) of that by steps of the cameras' rotations."""
+        turn = self._log_scale_and_turns(state)[1]
+        result: Floats = (self.scale_by_rotation[:, None] @ se3.inverse_left_jacobian(turn))[:, 0]
+        return result
 
     def _log_scale_and_turns(self, state: State) -> tuple[float, Floats]:
         turn = se3.log_so3(state.camera_rotation @ np.swapaxes(self.rotation, 1, 2))
@@ -310,13 +317,12 @@ class ScalePrior:
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        log_scale, turn = self._log_scale_and_turns(state)
-        jacobian = (self.scale_by_rotation[:, None] @ se3.inverse_left_jacobian(turn))[:, 0] / self.sigma
+        jacobian = self.by_steps(state) / self.sigma
         free = np.flatnonzero(layout.camera_slot >= 0)
         rows = ((layout.camera_dof * layout.camera_slot[free])[:, None] + np.arange(3)).ravel()
         row = jacobian[free].ravel()
         extra.cameras[np.ix_(rows, rows)] += np.outer(row, row)
-        extra.camera_gradient[rows] += (log_scale - self.log_scale) / self.sigma * row
+        extra.camera_gradient[rows] += (self.log_scale_of(state) - self.log_scale) / self.sigma * row
 
 
 @dataclass(frozen=True, kw_only=True)

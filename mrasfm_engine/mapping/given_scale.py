@@ -39,6 +39,9 @@ ROTATION_SIGMA_PX = LENS_SIGMA_PX / np.sqrt(PATTERNS)
 MEASURED_RANGE = 100.0  # the largest errors of rotations that no calibration found, over those of one
 CONTRADICTED_SIGMAS = 3.0
 LEAST_SHARE = 0.1  # in the mean: with less it changes little, but would hold images that have not found their scale
+# Of the images' variance, that the residual leaves at least. The mean comes out the same with any; with next to none
+# the normal equations would keep few digits of what the cameras do with it.
+LEAST_PULL = 1e-4
 RIDGE = 1e-9
 
 
@@ -97,6 +100,7 @@ def scale_of_given_rotations(
         log_scale=0.0,
         sigma=np.inf,
         sigma_scale=of_free,
+        sigma_of_corrections=0.0,
     )
     found = images_alone.log_scale_of(mapper.state)
     # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
@@ -106,12 +110,13 @@ def scale_of_given_rotations(
     if share < LEAST_SHARE:
         return images_alone
     # Images pull back with their own weight. Those that hardly resist go no farther than twice the way.
-    pull = min(ratio2, 1.0)
+    pull = float(np.clip(ratio2, LEAST_PULL, 1.0))
     return replace(
         images_alone,
         log_scale=found * (1.0 - share * (1.0 + pull)),
-        sigma=as_weighed * float(np.sqrt(pull)),
+        sigma=float(as_weighed * np.sqrt(pull)),
         sigma_scale=float(np.hypot(share * of_given, (1.0 - share) * of_free)),
+        sigma_of_corrections=share * of_given,
     )
 
 

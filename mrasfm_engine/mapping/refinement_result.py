@@ -163,7 +163,8 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
     problem = problem_of_all_unknowns(mapper, result)
     if problem is None:
         return None
-    return _with_lens_errors(result, of_cameras_alone(mapper, covariances(problem, problem.state)))
+    certainty = of_cameras_alone(mapper, covariances(problem, problem.state))
+    return _with_errors_of_given_scale(mapper, result, certainty)
 
 
 def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | None:
@@ -192,8 +193,14 @@ def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | Non
     return None if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE else problem
 
 
-def _with_lens_errors(result: Refinement, certainty: Covariances | None) -> Covariances | None:
-    """The certainty with what lens models and given rotations leave open of the scale, where positions do not tell."""
-    if certainty is None or result.given_scale is None:
+def _with_errors_of_given_scale(mapper: Mapper, result: Refinement, certainty: Covariances) -> Covariances:
+    """The certainty with what lens models and given rotations leave open, where positions do not tell the scale.
+
+    That is of the scale, and of the rotations that were asked to come to it.
+    """
+    if result.given_scale is None:
         return certainty
-    return certainty.with_scale_error(result.given_scale.sigma_scale)
+    of_cameras = np.zeros((len(mapper.camera_kind), 6))
+    of_cameras[:, :3] = result.given_scale.by_steps(mapper.state)
+    certainty = certainty.with_scale_error(result.given_scale.sigma_scale)
+    return certainty.with_calibration_error(of_cameras.ravel(), result.given_scale.sigma_of_corrections)

@@ -37,6 +37,7 @@ MANY_CAMERAS, LEAST_DIRECTIONS = 6, 6
 
 SIMULATED, UNITS, POINTS, NOISE_PX = 50, 24, 2500, 0.7
 CAMERAS = (6, 2)  # in turn
+SIMULATED_WITHOUT_GNSS, UNITS_WITHOUT_GNSS, CAMERAS_WITHOUT_GNSS = 20, 20, (6, 3)
 OFF_DEG, OFF_M = 0.3, 0.02  # what the calibration is off by and declared to be, for each axis
 GNSS_M = np.array([0.3, 0.3, 0.45])
 ANTENNA_M = np.array([-0.5, 0.2, 1.5])
@@ -108,6 +109,26 @@ def _calibration(drive: Path, scene: Path) -> dict[str, tuple[np.ndarray, np.nda
     }
 
 
+def without_positions(data: Path, work: Path) -> Iterator[Figure]:
+    """Line 19c: calibrations of short simulated drives without GNSS, whose given rotations tell the scale as well."""
+    del data, work  # there are no files
+    found = []
+    for seed in range(SIMULATED_WITHOUT_GNSS):
+        drive, rng = _drive(seed, CAMERAS_WITHOUT_GNSS[seed % len(CAMERAS_WITHOUT_GNSS)], UNITS_WITHOUT_GNSS)
+        mapper, refinement = _adjusted(drive, rng, with_gnss=False)
+        assert refinement.certainty is not None
+        found.append((camera_errors(mapper, drive) / refinement.certainty.sigma_camera[:, :6]).reshape(-1, 2, 3))
+    for k, what in enumerate(("rotations", "translations")):
+        values = np.concatenate([one[:, k] for one in found])
+        yield Figure(
+            line="19c",
+            what=f"{SIMULATED_WITHOUT_GNSS} simulated drives without GNSS: {what}, errors over their sigmas, RMS",
+            value=float(np.sqrt(np.mean(np.square(values)))),
+            above=LEAST_SIMULATED,
+            most=MOST_SIMULATED,
+        )
+
+
 @dataclass(frozen=True, kw_only=True)
 class InSigmas:
     """Errors of one simulated drive over their stated sigmas, and these sigmas over the exact ones."""
@@ -141,17 +162,13 @@ def simulated(data: Path, work: Path) -> Iterator[Figure]:
 
 
 def _in_sigmas(seed: int, cameras: int) -> InSigmas:
-    rng = np.random.default_rng(seed)
-    given = lambda rig: _moved(rig, rng)  # noqa: E731
-    drive = make_simulated_drive(
-        units=UNITS, cameras=cameras, points=POINTS, noise_px=NOISE_PX, given=given, seed=seed
-    )  # fmt: skip
-    mapper, refinement = _adjusted(drive, rng)
+    drive, rng = _drive(seed, cameras, UNITS)
+    mapper, refinement = _adjusted(drive, rng, with_gnss=True)
     certainty, state = refinement.certainty, mapper.state
     assert certainty is not None
     truth_m = drive.world_from_rig[:, :3, 3]
     scale = align_similarity(state.unit_position_m, truth_m).scale
-    off = _camera_errors(mapper, drive) / certainty.sigma_camera[:, :6]
+    off = camera_errors(mapper, drive) / certainty.sigma_camera[:, :6]
     return InSigmas(
         scale=float(np.log(scale)) / certainty.sigma_scale,
         positions=(state.unit_position_m - truth_m) / certainty.sigma_unit_position_m,
@@ -161,23 +178,27 @@ def _in_sigmas(seed: int, cameras: int) -> InSigmas:
     )
 
 
+def _drive(seed: int, cameras: int, units: int) -> tuple[SimulatedDrive, np.random.Generator]:
+    """A drive whose calibration is off as it is declared, and the generator of what else is random about it."""
+    rng = np.random.default_rng(seed)
+    given = lambda rig: _moved(rig, rng)  # noqa: E731
+    drive = make_simulated_drive(
+        units=units, cameras=cameras, points=POINTS, noise_px=NOISE_PX, given=given, seed=seed
+    )  # fmt: skip
+    return drive, rng
+
+
 def _moved(rig_from_cam: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     turn = se3.exp_so3(rng.normal(0, np.radians(OFF_DEG), (len(rig_from_cam), 3)))
     place = rig_from_cam[:, :3, 3] + rng.normal(0, OFF_M, (len(rig_from_cam), 3))
     return np.asarray(se3.transform(turn @ rig_from_cam[:, :3, :3], place))
 
 
-def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, Refinement]:
+def _adjusted(drive: SimulatedDrive, rng: np.random.Generator, *, with_gnss: bool) -> tuple[Mapper, Refinement]:
     settings = BundleAdjustmentConfig(sigma_rotation_deg=OFF_DEG, sigma_translation_m=OFF_M)
     bands = RowBands.from_drive(drive.drive, compensate=True)
     keypoints = Keypoints.from_features(drive.drive, drive.features, bands)
-    antenna_m = se3.apply(drive.world_from_rig, ANTENNA_M[None])[:, 0]
-    track = GnssTrack(
-        timestamps_us=drive.drive.timestamps_us,
-        position_m=antenna_m + rng.normal(size=antenna_m.shape) * GNSS_M,
-        sigma_m=np.tile(GNSS_M, (len(antenna_m), 1)),
-        good=np.ones(len(antenna_m), dtype=np.bool_),
-    )
+    track = _track(drive, rng) if with_gnss else None
     mapper = map_drive(
         drive.drive,
         keypoints,
@@ -189,7 +210,17 @@ def _adjusted(drive: SimulatedDrive, rng: np.random.Generator) -> tuple[Mapper, 
     return mapper, refine(mapper, AbsolutePriors(gnss=track, antenna_in_rig_m=ANTENNA_M))
 
 
-def _camera_errors(mapper: Mapper, drive: SimulatedDrive) -> np.ndarray:
+def _track(drive: SimulatedDrive, rng: np.random.Generator) -> GnssTrack:
+    antenna_m = se3.apply(drive.world_from_rig, ANTENNA_M[None])[:, 0]
+    return GnssTrack(
+        timestamps_us=drive.drive.timestamps_us,
+        position_m=antenna_m + rng.normal(size=antenna_m.shape) * GNSS_M,
+        sigma_m=np.tile(GNSS_M, (len(antenna_m), 1)),
+        good=np.ones(len(antenna_m), dtype=np.bool_),
+    )
+
+
+def camera_errors(mapper: Mapper, drive: SimulatedDrive) -> np.ndarray:
     """Errors (c, 6) of the cameras' rotations (rad) and positions, without a motion that all have in common."""
     prior, true = calibration_prior(mapper), drive.truth.rig_from_cam
     assert prior.gauge_weights is not None

@@ -189,6 +189,24 @@ def test_positions_are_no_more_certain_than_the_scale() -> None:
     assert (sigma_m > 0.9 * more.sigma_scale * away_m[1:]).all()
 
 
+def test_an_error_of_one_combination_of_rotations_moves_all_cameras_as_it_lets_them() -> None:
+    case = stereo(0, units=12)
+    alone = covariances(replace(case.problem, terms=[prior_of(case.truth)]), case.truth, shared_errors=False)
+    functional = np.zeros(12)
+    functional[[2, 8]] = 1.0, -1.0  # yaw of one camera against the other
+    more = alone.with_calibration_error(functional, 0.01)
+    left = functional @ alone.calibration @ functional
+    assert functional @ more.calibration @ functional == pytest.approx(left + 0.01**2)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(more.calibration)).reshape(2, 6), more.sigma_camera[:, :6])
+    assert (more.sigma_camera[:, 2] > 0.004).all()
+    # What the combination says nothing of is as certain as before.
+    other = np.zeros(12)
+    other[3] = 1.0
+    other = other - functional * (functional @ alone.calibration @ other) / left
+    assert other @ more.calibration @ other == pytest.approx(other @ alone.calibration @ other)
+    assert alone.with_calibration_error(0.0 * functional, 0.01) is alone
+
+
 def test_an_error_of_the_scale_moves_what_positions_leave_open() -> None:
     """Positions at the beginning hold it, and all behind goes farther away."""
     case = stereo(0, units=12)

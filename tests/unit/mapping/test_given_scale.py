@@ -20,6 +20,7 @@ from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement, solver_options
 from schemas import Gnss, GnssSample
+from tests.benchmarks.sigmas import camera_errors
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -107,6 +108,38 @@ def test_scale_is_better_known_than_by_either_and_as_well_as_is_stated(monkeypat
     free = [refined(one)[0] for one in drives]
     assert 1e-4 < rms(both) < min(rms(held), rms(free))
     assert 0.5 < rms((np.array(both) / sigmas).tolist()) < 2.0
+
+
+def test_cameras_are_as_certain_as_the_rotations_that_they_are_asked_to_come_to() -> None:
+    """Rotations that were measured by hand say where the scale lies, and turn cameras by what they err."""
+    in_sigmas = []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+
+        def turned(rig_from_cam: np.ndarray, rng: np.random.Generator = rng) -> np.ndarray:
+            turn = se3.exp_so3(rng.normal(0, np.radians(0.3), (len(rig_from_cam), 3)))
+            return np.asarray(se3.transform(turn @ rig_from_cam[:, :3, :3], rig_from_cam[:, :3, 3]))
+
+        simulated = make_simulated_drive(units=UNITS, cameras=3, points=1500, given=turned, seed=seed)
+        model = make_model(simulated, config=EngineConfig(threads=1))
+        mapper = with_true_poses(model, simulated, range(UNITS))
+        result = refine(mapper)
+        assert result.given_scale is not None
+        assert result.certainty is not None
+        in_sigmas.append(camera_errors(mapper, simulated)[:, :3] / result.certainty.sigma_camera[:, :3])
+    assert 0.4 < rms(np.ravel(in_sigmas).tolist()) < 1.5
+
+
+def test_lenses_of_which_nothing_is_known_leave_all_digits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Images then say nothing of the scale, and cameras are as certain as with lenses of which hardly anything is."""
+    simulated, sigmas = make_simulated_drive(units=UNITS, cameras=3, points=1000, seed=1), []
+    for lens_px in (5e2, 5e5):
+        monkeypatch.setattr(given_scale, "LENS_SIGMA_PX", lens_px)
+        mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(UNITS))
+        certainty = refine(mapper).certainty
+        assert certainty is not None
+        sigmas.append(certainty.sigma_camera[:, :6])
+    np.testing.assert_allclose(*sigmas, rtol=0.02)
 
 
 def test_images_weigh_less_for_errors_of_lenses_and_the_residual_keeps_its_share() -> None:
