@@ -90,7 +90,7 @@ class Mapper:
         bands = RowBands.from_drive(drive, compensate=config.mapping.motion_compensation)
         self.motion = RigMotion(bands, drive.timestamps_us)
         if self.motion.needed:
-            self._place_bands()
+            self.place_bands()
         self.triangulator = Triangulator(
             keypoints,
             bands.unit,
@@ -207,9 +207,10 @@ class Mapper:
         for image, pose in zip(images, unit_from_image, strict=True):
             self.motion.set_image_pose(int(image), pose)
         if self.state.simultaneous:
-            self._place_bands()
+            self.place_bands()
 
-    def _place_bands(self) -> None:
+    def place_bands(self) -> None:
+        """Give the state row bands, all at their units: their motion counts from now on."""
         count = len(self.motion.bands)
         self.state = replace(
             self.state, band_rotation=np.tile(np.eye(3), (count, 1, 1)), band_position_m=np.zeros((count, 3))

@@ -127,7 +127,8 @@ def finding(name: str, wrong: Miscalibration) -> Finding:
         f"rig.cameras says; the other cameras by {wrong.others_rotation_deg:.2f} deg and "
         f"{wrong.others_translation_m:.3f} m as a rule",
         "Check first that params and images are its own, and not mirrored or turned: no pose is right for others. "
-        "It was recalibrated: take its pose from calibration.json, and check how it is mounted.",
+        "It was recalibrated: take its pose from calibration.json, and check how it is mounted. One whose images are "
+        "late seems to be mounted farther ahead or back: where they may be, declare its sigma_time_offset_us.",
     )
 
 

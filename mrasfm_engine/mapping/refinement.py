@@ -56,6 +56,7 @@ from mrasfm_engine.mapping.time_offsets import (
     time_prior,
     times_may_vary,
 )
+from mrasfm_engine.mapping.undeclared_times import undeclared_time_findings
 from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
@@ -175,6 +176,14 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
         offset_s = mapper.state.camera_time_offset_s
         prior = time_prior(mapper, mean_varies=result.mean_time_varies)
         result.late_cameras = time_findings(mapper.drive, offset_s, prior, result.times)
+    if result.calibration.free:
+        result.late_cameras += undeclared_time_findings(
+            mapper,
+            free_units=free_units & mapper.registered,
+            terms=terms_of(mapper, result),
+            options=solver_options(mapper, result),
+            cancel=cancel,
+        )
     known = calibration_prior(mapper), mapper.state, result.directions
     result.miscalibrations = find_miscalibrations(*known)
     result.wrong_pair = find_wrong_pair(*known)
