@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from mrasfm_engine.bundle_adjustment.priors import ReadoutPrior
 from mrasfm_engine.bundle_adjustment.problem import CAMERA_DOF, READOUT, TIME, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Eliminated, ReducedCameraSystem
 from mrasfm_engine.bundle_adjustment.shared_errors import SharedErrors, find_shared_errors
@@ -106,7 +105,8 @@ def covariances(problem: Problem, state: State, *, shared_errors: bool = True) -
 
 def sigma_factor_of_shared_errors(problem: Problem, state: State) -> float:
     """The `sigma_factor` of `covariances` alone, for half of its time; one where there is too little to tell."""
-    found = _shared_errors(problem, state)
+    curved = _CurvedInverse.at(problem, state)
+    found = None if curved is None else curved.shared_errors()
     return 1.0 if found is None else found.sigma_factor
 
 
@@ -135,12 +135,19 @@ def _regular_marginals(
     units, border = eliminated.inverse()
     variance = np.diagonal(units, axis1=1, axis2=2).copy()
     variance[unseen[:split].reshape(-1, UNIT_DOF)] = np.inf
-    columns, joint, of_readouts = _of_functionals(problem, state, eliminated, border)
+    columns, joint = _with_scale(problem, state, eliminated, border)
+    readouts = _places_of_readouts(problem, eliminated.free)
+    readout_steps, readout_covariance = -columns[:, readouts].T @ system.gradient, joint[np.ix_(readouts, readouts)]
+    columns, joint, by_readouts = _with_readouts_as_declared(columns, joint, readouts)
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
     of_independent = joint[-1, -1]
-    found = _shared_errors(problem, state) if shared_errors else None
-    joint = (joint if found is None else found.covariance) + of_readouts
+    found = _CurvedInverse.at(problem, state) if shared_errors else None
+    of_shared, of_readouts = (None, None) if found is None else (found.shared_errors(), found.shared_errors_of_readouts())
+    joint = joint if of_shared is None else of_shared.covariance
+    if of_readouts is not None:
+        readout_covariance = of_readouts.covariance
+    joint = joint + by_readouts @ (np.outer(readout_steps, readout_steps) + readout_covariance) @ by_readouts.T
     loose = eliminated.free[unseen[split:][eliminated.free]]
     covariances_of_cameras = np.zeros((2, *(layout.camera_dof * layout.num_cameras,) * 2))
     for covariance, own in zip(covariances_of_cameras, (joint[:-1, :-1], cameras), strict=True):
@@ -159,32 +166,53 @@ def _regular_marginals(
         sigma_scale=scale,
         sigma_scale_of_independent_errors=scale_of_independent,
         by_scale_m=columns[:split, -1].reshape(-1, UNIT_DOF)[:, 3:] / max(of_independent, 1e-30),
-        sigma_factor=1.0 if found is None else found.sigma_factor,
+        sigma_factor=1.0 if of_shared is None else of_shared.sigma_factor,
     )
 
 
-def _shared_errors(problem: Problem, state: State) -> SharedErrors | None:
-    """Errors that observations share, by the cameras' unknowns and the scale: covariances are (f + 1, f + 1).
+@dataclass(frozen=True, kw_only=True)
+class _CurvedInverse:
+    """Columns of the inverse with the curvature of the loss, from which shared errors follow."""
 
-    None where they are too few to tell, or do not determine all by the curvature of their loss.
-    """
-    curved = problem.with_curvature()
-    system = curved.normal_equations(state, 0.0)
-    unseen = system.matrix_diagonal() == 0.0  # below zero, the loss bends the other way: there is no factor
-    eliminated = system.eliminate(unseen.astype(np.float64))
-    if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
-        return None
-    columns, joint, _ = _of_functionals(curved, state, eliminated, eliminated.inverse_of_border())
-    return find_shared_errors(curved, state, system, columns, joint)
+    problem: Problem
+    state: State
+    system: ReducedCameraSystem
+    columns: Floats  # (n, f + 1) for the cameras' unknowns and the scale
+    joint: Floats  # (f + 1, f + 1) covariance of these
+    readouts: Ints  # (r,) among them
+
+    @staticmethod
+    def at(problem: Problem, state: State) -> _CurvedInverse | None:
+        """None where the loss' curvature does not determine all."""
+        curved = problem.with_curvature()
+        system = curved.normal_equations(state, 0.0)
+        unseen = system.matrix_diagonal() == 0.0  # below zero, the loss bends the other way: there is no factor
+        eliminated = system.eliminate(unseen.astype(np.float64))
+        if eliminated is None or eliminated.smallest_pivot(system, unseen) < SINGULAR:
+            return None
+        columns, joint = _with_scale(curved, state, eliminated, eliminated.inverse_of_border())
+        readouts = _places_of_readouts(curved, eliminated.free)
+        return _CurvedInverse(
+            problem=curved, state=state, system=system, columns=columns, joint=joint, readouts=readouts
+        )
+
+    def shared_errors(self) -> SharedErrors | None:
+        """Of the cameras' unknowns and the scale, for readouts that stay; None where observations are too few."""
+        columns, joint, _ = _with_readouts_as_declared(self.columns, self.joint, self.readouts)
+        return find_shared_errors(self.problem, self.state, self.system, columns, joint)
+
+    def shared_errors_of_readouts(self) -> SharedErrors | None:
+        """Of the readouts that vary, (r, r)."""
+        if not len(self.readouts):
+            return None
+        own = self.joint[np.ix_(self.readouts, self.readouts)]
+        return find_shared_errors(self.problem, self.state, self.system, self.columns[:, self.readouts], own)
 
 
-def _of_functionals(
-    problem: Problem, state: State, eliminated: Eliminated, border: Floats
-) -> tuple[Floats, Floats, Floats]:
-    """Columns (n, f + 1) of the inverse for the cameras' unknowns and the scale, their covariance, and what readouts
-    add to it."""
-    columns, joint = _with_scale(problem, state, eliminated, border)
-    return _with_readouts_as_declared(problem, columns, joint, eliminated.free)
+def _places_of_readouts(problem: Problem, free: Ints) -> Ints:
+    """Places of the readouts that vary among the unknowns (f,) of the cameras that do."""
+    at = np.flatnonzero(free % problem.layout.camera_dof == READOUT)
+    return at if problem.layout.free_readouts.any() else at[:0]
 
 
 def _with_scale(problem: Problem, state: State, eliminated: Eliminated, border: Floats) -> tuple[Floats, Floats]:
@@ -202,27 +230,20 @@ def _with_scale(problem: Problem, state: State, eliminated: Eliminated, border: 
     return columns, joint
 
 
-def _with_readouts_as_declared(
-    problem: Problem, columns: Floats, covariance: Floats, free: Ints
-) -> tuple[Floats, Floats, Floats]:
+def _with_readouts_as_declared(columns: Floats, covariance: Floats, readouts: Ints) -> tuple[Floats, Floats, Floats]:
     """Columns and covariance as `_with_scale` has them where readouts vary, for readouts that stay as they are.
 
-    And the covariance that it adds that readouts are not what was declared [a consider covariance: Bierman,
-    Factorization Methods for Discrete Sequential Estimation, 1977]: rows of another time pass for a time offset, and
-    turn and move cameras.
+    And by how much (f + 1, r) the unknowns err for each that is not what was declared: rows of another time pass for a
+    time offset, and turn and move cameras. What their squares come to follows from what the drive says of readouts: the
+    step that it would take there, and the covariance of that [a consider covariance: Bierman, Factorization Methods for
+    Discrete Sequential Estimation, 1977].
     """
-    dof = problem.layout.camera_dof
-    of_readouts = np.zeros_like(covariance)
-    at = np.flatnonzero(free % dof == READOUT) if problem.layout.free_readouts.any() else np.zeros(0, dtype=np.int64)
-    if not len(at):
-        return columns, covariance, of_readouts
-    known = next(term for term in problem.terms if isinstance(term, ReadoutPrior))
-    gain = covariance[:, at] @ np.linalg.inv(covariance[np.ix_(at, at)])
-    of_readouts = known.sigma_s**2 * gain @ gain.T
-    of_readouts[at] = of_readouts[:, at] = 0.0
-    columns, covariance = columns - columns[:, at] @ gain.T, covariance - gain @ covariance[at]
-    columns[:, at] = covariance[at] = covariance[:, at] = 0.0
-    return columns, covariance, of_readouts
+    if not len(readouts):
+        return columns, covariance, np.zeros((len(covariance), 0))
+    gain = covariance[:, readouts] @ np.linalg.inv(covariance[np.ix_(readouts, readouts)])
+    columns, covariance = columns - columns[:, readouts] @ gain.T, covariance - gain @ covariance[readouts]
+    columns[:, readouts] = covariance[readouts] = covariance[:, readouts] = gain[readouts] = 0.0
+    return columns, covariance, gain
 
 
 def _dense_marginals(system: ReducedCameraSystem, position: Floats) -> _Marginals:

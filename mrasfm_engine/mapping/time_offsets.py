@@ -7,7 +7,7 @@ unless the manifest says how well their times are known.
 
 A shutter that rolls although the manifest does not say so passes for an offset: a camera's lower rows see what is near,
 and see it later. Where no readout is declared, 0 for rows that are all taken at once included, an offset's sigma says
-what a usual one would do to it.
+what the one would do to it that the residuals show.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
 from mrasfm_engine.mapping.time_offsets import assess_times, offsets_are_steady, time_prior, times_may_vary
+from tests.benchmarks.sigmas import camera_errors
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_model,
@@ -109,16 +110,38 @@ def test_the_mean_is_that_of_most_cameras_unless_positions_tell_it() -> None:
         assert (np.abs(off_s) < 3 * result.times.sigma_s).all()
 
 
-@pytest.mark.slow
-def test_a_readout_that_is_not_declared_may_be_what_passes_for_an_offset(
-    late: tuple[Mapper, SimulatedDrive, Refinement],
-) -> None:
-    declared, unknown = late, model(LATE_MS, readout_us=None)
-    certain, uncertain = declared[2].times, refined(*unknown).times
-    assert certain is not None
-    assert uncertain is not None
-    assert (uncertain.sigma_s > 2 * certain.sigma_s).all()
-    np.testing.assert_allclose(declared[0].state.camera_time_offset_s, unknown[0].state.camera_time_offset_s, atol=1e-6)
+def of_readouts(readout_ms: int, *, declared: bool) -> tuple[np.ndarray, np.ndarray, Refinement]:
+    """Errors (4, 6) of the cameras' poses over their sigmas, those of offsets over theirs, and the refinement."""
+    simulated = make_simulated_drive(
+        units=20, cameras=4, points=1500, time_offset_ms=APART_MS, late_ms=LATE_MS, readout_ms=readout_ms
+    )
+    readout_us = 1000 * readout_ms if declared else None
+    cameras = [
+        c.model_copy(update={"readout_us": readout_us, "sigma_time_offset_us": 5000.0}) for c in simulated.drive.cameras
+    ]
+    simulated = with_cameras(simulated, cameras)
+    mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(20))
+    result = refine(mapper)
+    assert result.certainty is not None
+    assert result.times is not None
+    weights = time_prior(mapper, mean_varies=False).gauge_weights
+    assert weights is not None
+    off_s = mapper.state.camera_time_offset_s - 1e-3 * (np.array(LATE_MS) - np.average(LATE_MS, weights=weights))
+    of_cameras = camera_errors(mapper, simulated) / result.certainty.sigma_camera[:, :6]
+    return of_cameras, off_s / result.times.sigma_s, result
+
+
+def test_a_shutter_of_which_nothing_is_declared_counts_as_it_shows() -> None:
+    """Images of a global shutter show that no row is late, and those of a rolling one that rows are."""
+    known, unknown, rolling = (of_readouts(ms, declared=of) for ms, of in ((0, True), (0, False), (20, False)))
+    sigmas = []
+    for of_cameras, of_times, result in (known, unknown, rolling):
+        assert 0.3 < rmse(of_cameras.ravel()) < 1.6
+        assert 0.2 < rmse(of_times) < 2.5
+        assert result.certainty is not None
+        sigmas.append(result.certainty.sigma_camera[:, :3])
+    assert (sigmas[1] < 1.5 * sigmas[0]).all()
+    assert (sigmas[2] > 1.5 * sigmas[0]).any()
 
 
 def test_leaving_the_prior_is_a_finding() -> None:
