@@ -171,7 +171,8 @@ def require_images_as_listed(
         for cameras in looked_at:
             # A turn of less is left to the calibration's own estimate, whose prior is some degrees.
             least_deg = np.degrees(largest_turn_rad(*sigma_rad[list(cameras)]))
-            share = compared[cameras].share if cameras in compared else 0.0
+            # Matches at the edges of two views, in a narrow part of either, may fit a turn as well as the rig as given.
+            share = compared[cameras].share if cameras in compared else searches[cameras].share_as_given()
             if share < CLEARLY_WORSE and turns_deg[cameras] > least_deg:
                 raise _turned(drive, cameras, turns_deg[cameras])
         shares = {

@@ -110,6 +110,10 @@ class RelistedImages:
         given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
         return float(se3.rotation_angle_deg(given.T @ b_from_a))
 
+    def share_as_given(self) -> float:
+        """Median share of the matches of frames that list them that fits the calibration as given; 0 without any."""
+        return float(np.median([self._near(rays).mean() for rays in self._listed])) if self._listed else 0.0
+
     def see_the_same(self) -> bool:
         """True where images of the frames that list them have matches besides those of what is drawn into them."""
         return len(self._listed) >= MIN_UNITS

@@ -14,7 +14,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.matching.contradicted_rig import require_images_as_listed
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
 from mrasfm_engine.matching.pair_matching import match_pairs
-from mrasfm_engine.matching.relisted_images import MAX_LAG, _common_rotation
+from mrasfm_engine.matching.relisted_images import MAX_LAG, RelistedImages, _common_rotation
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures
 from schemas.findings import Finding
@@ -263,6 +263,25 @@ def test_cameras_that_look_apart_pass() -> None:
 @pytest.mark.parametrize("turn_deg", [1.0, 5.0, 18.0])
 def test_a_camera_that_is_a_little_off_is_left_to_the_calibrations_own_estimate(turn_deg: float) -> None:
     assert street(given=turned(1, (1, 0, 0), turn_deg)).check() is None
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 60.0])
+def test_cameras_that_fit_as_given_are_not_turned_however_else_they_fit(
+    off_deg: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cameras that hardly share a view have no matches in the pairs, and a few at the edges of some images."""
+    made = street(given=turned(1, (0, 0, 1), off_deg))
+    matcher, images = NearestNeighbourMatcher(CONFIG), made.drive.images
+    apart = np.array([(i, i + 2) for i in range(len(images) - 2)])  # of one camera each
+    found = match_pairs(made.drive, made.features, apart, matcher, CONFIG, made.calibration, threads=1)
+    monkeypatch.setattr(RelistedImages, "turn_deg", lambda self: 60.0)
+    arguments = (made.drive, made.features, found.pairs, matcher, CONFIG, made.calibration)
+    if off_deg:
+        with pytest.raises(InputError) as caught:
+            require_images_as_listed(*arguments, max_depth_m=50.0)
+        assert caught.value.code == "camera-turned"
+    else:
+        assert require_images_as_listed(*arguments, max_depth_m=0.1) is None
 
 
 def test_a_vehicle_that_stands_shows_no_lag() -> None:
