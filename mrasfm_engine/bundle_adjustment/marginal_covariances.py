@@ -142,8 +142,9 @@ def _regular_marginals(
     cameras, scale_with_cameras = joint[:-1, :-1], np.zeros(layout.camera_dof * layout.num_cameras)
     scale_with_cameras[eliminated.free] = joint[-1, :-1]
     of_independent = joint[-1, -1]
-    found = _CurvedInverse.at(problem, state) if shared_errors else None
-    of_shared, of_readouts = (None, None) if found is None else (found.shared_errors(), found.shared_errors_of_readouts())
+    curved = _CurvedInverse.at(problem, state) if shared_errors else None
+    of_shared = None if curved is None else curved.shared_errors()
+    of_readouts = None if curved is None else curved.shared_errors_of_readouts()
     joint = joint if of_shared is None else of_shared.covariance
     if of_readouts is not None:
         readout_covariance = of_readouts.covariance
@@ -178,7 +179,7 @@ class _CurvedInverse:
     state: State
     system: ReducedCameraSystem
     columns: Floats  # (n, f + 1) for the cameras' unknowns and the scale
-    joint: Floats  # (f + 1, f + 1) covariance of these
+    covariance: Floats  # (f + 1, f + 1) of these
     readouts: Ints  # (r,) among them
 
     @staticmethod
@@ -193,19 +194,19 @@ class _CurvedInverse:
         columns, joint = _with_scale(curved, state, eliminated, eliminated.inverse_of_border())
         readouts = _places_of_readouts(curved, eliminated.free)
         return _CurvedInverse(
-            problem=curved, state=state, system=system, columns=columns, joint=joint, readouts=readouts
+            problem=curved, state=state, system=system, columns=columns, covariance=joint, readouts=readouts
         )
 
     def shared_errors(self) -> SharedErrors | None:
-        """Of the cameras' unknowns and the scale, for readouts that stay; None where observations are too few."""
-        columns, joint, _ = _with_readouts_as_declared(self.columns, self.joint, self.readouts)
-        return find_shared_errors(self.problem, self.state, self.system, columns, joint)
+        """Errors of the cameras' unknowns and the scale, for readouts that stay; None of too few observations."""
+        columns, covariance, _ = _with_readouts_as_declared(self.columns, self.covariance, self.readouts)
+        return find_shared_errors(self.problem, self.state, self.system, columns, covariance)
 
     def shared_errors_of_readouts(self) -> SharedErrors | None:
-        """Of the readouts that vary, (r, r)."""
+        """Errors (r, r) of the readouts that vary."""
         if not len(self.readouts):
             return None
-        own = self.joint[np.ix_(self.readouts, self.readouts)]
+        own = self.covariance[np.ix_(self.readouts, self.readouts)]
         return find_shared_errors(self.problem, self.state, self.system, self.columns[:, self.readouts], own)
 
 

@@ -98,7 +98,7 @@ def choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) ->
     if is_last:
         mapper.readmit()
     else:
-        mapper.complete()
+        mapper.complete(anew=True)
     observations, points = mapper.filter(mapper.config.mapping.filter_error_px)
     result.observations_dropped += observations
     result.points_dropped += points

@@ -301,10 +301,10 @@ class Mapper:
         again[tracks[~has_point]] = again[tracks[has_point][~fits]] = True
         self.triangulate(np.flatnonzero(again & ~self.rejected))
 
-    def complete(self) -> None:
+    def complete(self, *, anew: bool = False) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point.
 
-        One that fewer than two fit is sought anew: poses may have moved further than it could follow.
+        Points that fewer than two fit are sought `anew`: poses may have moved further than they could follow.
         """
         of_keypoint = self.tracks.of_keypoint
         rows = np.flatnonzero((of_keypoint >= 0) & self.registered[self.keypoints.unit])
@@ -314,7 +314,8 @@ class Mapper:
         fits = errors < self.triangulator.max_error_px
         self.is_inlier[:] = False
         self.is_inlier[rows] = fits
-        self.triangulated &= np.bincount(of_keypoint[rows[fits]], minlength=len(self.tracks)) >= 2
+        if anew:
+            self.triangulated &= np.bincount(of_keypoint[rows[fits]], minlength=len(self.tracks)) >= 2
         self.rejected[:] = False
         self.triangulate(np.flatnonzero(~self.triangulated))
         self.filter(self.triangulator.max_error_px)

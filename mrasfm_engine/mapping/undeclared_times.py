@@ -1,10 +1,11 @@
 """Cameras whose images were taken at another time than those that the manifest says were taken with them.
 
 Where all images of a frame have one timestamp, cameras have no time offsets in the adjustment. One that is late comes
-out as mounted elsewhere, and bends the trajectory. One Gauss-Newton step from the adjusted scene, in which offsets vary
-beside everything else, says which would leave zero [a score test: Rao, Mathematical Proceedings of the Cambridge
-Philosophical Society 1948]. Where one would by more than clocks err, a copy of the scene is adjusted with the offsets,
-and says how late the camera is, and how certain that is: its residuals no longer have what the offset makes of them.
+out as mounted elsewhere along the way, and bends the trajectory. Where one has moved so, one Gauss-Newton step from the
+adjusted scene, in which offsets vary beside everything else, says which would leave zero [a score test: Rao,
+Mathematical Proceedings of the Cambridge Philosophical Society 1948]. Where one would by more than clocks err, a copy
+of the scene is adjusted with the offsets, and says how late the camera is, and how certain that is: its residuals no
+longer have what the offset makes of them.
 
 The scene itself stays as it is: that a clock may be off the manifest has to say.
 """
@@ -21,7 +22,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import ReadoutPrior, Term, TimePrior
 from mrasfm_engine.bundle_adjustment.problem import TIME, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
-from mrasfm_engine.mapping.calibration import has_few_units
+from mrasfm_engine.mapping.calibration import calibration_prior, has_few_units
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.time_offsets import (
@@ -31,8 +32,12 @@ from mrasfm_engine.mapping.time_offsets import (
     interpolation_error_s,
     undeclared_readouts,
 )
+from mrasfm_engine.mapping.vehicle_speed import speeds_mps
 from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.findings import Finding, warning
+
+PART = 0.5  # of the way that a late camera seems to be displaced by, which its place has at least taken,
+HELD = 2.0  # or so many sigmas of its prior
 
 
 def undeclared_time_findings(
@@ -45,12 +50,12 @@ def undeclared_time_findings(
     free_units, terms, options
         Of an adjustment with all cameras free; the offsets' prior is added.
     """
-    if not _is_open(mapper):
-        return []
-    scene = _LateImages.from_adjusted(mapper, free_units, terms, options)
     usual_s = mapper.config.bundle_adjustment.sigma_time_offset_us / 1e6
     if len(mapper.camera_kind) == 2:
         usual_s /= np.sqrt(2.0)  # of half of what both are apart
+    if not (_is_open(mapper) and _seems_displaced(mapper, BEYOND_PRIOR_SIGMAS * usual_s)):
+        return []
+    scene = _LateImages.from_adjusted(mapper, free_units, terms, options)
     first_s = scene.first_step_s()
     if first_s is None or not _is_beyond(first_s, np.full(len(first_s), usual_s)).any():
         return []
@@ -80,9 +85,23 @@ def _is_open(mapper: Mapper) -> bool:
     )
 
 
-def _among_others(offset_s: Floats) -> Floats:
+def _seems_displaced(mapper: Mapper, least_s: float) -> bool:
+    """True where a camera has moved along the way as a late one would, by part of that or until its prior held it.
+
+    It takes next to no time, and spares most drives the rest.
+    """
+    rigs = mapper.state.world_from_rig[mapper.registered]
+    step_m = np.einsum("nji,nj->ni", rigs[:-1, :3, :3], np.diff(rigs[:, :3, 3], axis=0))
+    way = step_m.sum(0) / max(float(np.linalg.norm(step_m.sum(0))), 1e-9)
+    prior = calibration_prior(mapper)
+    along_m = np.abs(_among_others(prior.corrections(mapper.state)[:, 3:] @ way))
+    least_m = np.minimum(PART * np.median(speeds_mps(mapper)) * least_s, HELD * prior.sigma_translation_m)
+    return bool((along_m > least_m).any())
+
+
+def _among_others(offset: Floats) -> Floats:
     """Offsets (c,) from that of most cameras; of two each is half of what they are apart."""
-    result: Floats = offset_s - np.median(offset_s)
+    result: Floats = offset - np.median(offset)
     return result
 
 

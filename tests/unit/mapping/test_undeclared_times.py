@@ -93,6 +93,11 @@ def test_few_units_and_settings_leave_it(monkeypatch: pytest.MonkeyPatch) -> Non
     assert findings([0, 0, 40, 0], settings=BundleAdjustmentConfig(refine_time_offsets=False)) == []
 
 
-def test_without_a_suspicion_no_scene_is_adjusted_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(undeclared_times, "adjust_poses", None)
+def test_without_a_suspicion_nothing_is_asked_of_the_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(undeclared_times, "_LateImages", None)
     assert findings([0] * 3) == []
+
+
+def test_a_camera_at_a_wrong_place_does_not_have_the_scene_adjusted_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(undeclared_times, "adjust_poses", None)
+    assert findings([0] * 4, given=moved_ahead) == []

@@ -1,4 +1,4 @@
-"""Points of two observations that a third one of their track contradicts leave the scene."""
+"""Points that a scene gives up: those that their track contradicts, and those that poses have left behind."""
 
 from __future__ import annotations
 
@@ -42,3 +42,17 @@ def test_what_an_image_without_a_pose_shows_contradicts_nothing() -> None:
     longer = mapper.triangulated & (observed == 2) & (np.diff(mapper.tracks.first) > 2)
     assert longer.sum() > 5
     assert mapper.drop_contradicted() == 0
+
+
+def test_points_that_poses_have_left_behind_are_sought_anew_where_that_is_asked() -> None:
+    mapper = mapped(6)
+    mapper.complete()
+    every, left_behind = np.flatnonzero(mapper.triangulated), np.flatnonzero(mapper.triangulated)[::4]
+    places_m = mapper.state.points_m.copy()
+    mapper.state.points_m[left_behind, 2] += 20.0
+    mapper.complete(anew=True)
+    np.testing.assert_array_equal(np.flatnonzero(mapper.triangulated), every)
+    np.testing.assert_allclose(mapper.state.points_m[left_behind], places_m[left_behind], atol=0.5)
+    mapper.state.points_m[left_behind, 2] += 20.0
+    mapper.complete()
+    assert not mapper.triangulated[left_behind].any()
