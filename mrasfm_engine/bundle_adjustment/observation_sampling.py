@@ -117,28 +117,37 @@ def choose_points(observations: Observations, free_units: Bools, image_size_px: 
     an_image
         Observations an image wants. It gets fewer where it has fewer, and more where its points serve other images.
     """
-    o, (columns, rows) = observations, GRID
-    cell_px = image_size_px[o.camera] / GRID
-    place = np.clip((o.xy_px / cell_px).astype(np.int64), 0, np.array(GRID) - 1)
-    slot = np.where(free_units, np.cumsum(free_units) - 1, -1)[o.unit]
-    bucket = ((slot * len(image_size_px) + o.camera) * rows + place[:, 1]) * columns + place[:, 0]
-    cells = int(free_units.sum()) * len(image_size_px) * rows * columns
-    wanted = np.full(cells, -(-an_image // (rows * columns)), dtype=np.int64)
+    o, cells = observations, GRID[0] * GRID[1]
+    slot = np.where(free_units, np.cumsum(free_units) - 1, -1)
+    cell = _cells(o.unit, o.camera, o.xy_px, slot, image_size_px / GRID)
+    wanted = np.full(int(free_units.sum()) * len(image_size_px) * cells, -(-an_image // cells), dtype=np.int64)
     # numpy sorts integers of 16 bits by their digits, in a tenth of the time.
     length = np.minimum(np.diff(o.first_of_point), np.iinfo(np.int16).max).astype(np.int16)
-    result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, bucket, wanted)
+    result: Bools = _choose(np.argsort(-length, kind="stable"), o.first_of_point, cell, wanted)
     return result
 
 
 @njit(cache=True, nogil=True)
-def _choose(order: Any, first: Any, bucket: Any, wanted: Any) -> Any:
+def _cells(unit: Any, camera: Any, xy: Any, slot: Any, size: Any) -> Any:
+    """Number (n,) of the cell of an image of a free unit in which each observation is; below zero of other units."""
+    result, (columns, rows) = np.empty(len(unit), np.int64), GRID
+    for n in range(len(unit)):
+        c = camera[n]
+        column = min(max(int(xy[n, 0] / size[c, 0]), 0), columns - 1)
+        row = min(max(int(xy[n, 1] / size[c, 1]), 0), rows - 1)
+        result[n] = ((slot[unit[n]] * len(size) + c) * rows + row) * columns + column
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _choose(order: Any, first: Any, cell: Any, wanted: Any) -> Any:
     chosen = np.zeros(len(order), np.bool_)
     for p in order:
         for n in range(first[p], first[p + 1]):
-            if bucket[n] >= 0 and wanted[bucket[n]] > 0:  # below: images of units that are held
+            if cell[n] >= 0 and wanted[cell[n]] > 0:  # below: images of units that are held
                 chosen[p] = True
         if chosen[p]:
             for n in range(first[p], first[p + 1]):
-                if bucket[n] >= 0:
-                    wanted[bucket[n]] -= 1
+                if cell[n] >= 0:
+                    wanted[cell[n]] -= 1
     return chosen

@@ -85,12 +85,12 @@ def log_odds_of_moving(count: Ints, going_on: Ints) -> Floats:
     return result
 
 
-def _off_the_ground(points_m: Floats, path: GroundPath) -> Bools:
+def _off_the_ground(points_m: Floats, path: GroundPath, *, threads: int = 1) -> Bools:
     """Return whether points (n, 3) are higher than the path's ground at the nearest station.
 
     Far from the path the ground may be higher, too. What is meant is the road before the vehicle, which is near.
     """
-    station = np.asarray(cKDTree(path.ground_m).query(points_m)[1], dtype=np.int64)
+    station = np.asarray(cKDTree(path.ground_m).query(points_m, workers=threads)[1], dtype=np.int64)
     height_m = ((points_m - path.ground_m[station]) * path.up[station]).sum(1)
     result: Bools = height_m > path.tolerance_m
     return result
@@ -101,7 +101,7 @@ def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
     registered, state = np.flatnonzero(mapper.registered), mapper.state
     place, result = np.searchsorted(registered, unit), np.zeros(len(unit), dtype=np.bool_)
     for step in (-1, 1):
-        there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)))
+        there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)) & ~result)
         rig_from_world = se3.inverse(state.world_from_rig[registered[place[there] + step]])
         in_rig_m = se3.apply(rig_from_world, points_m[there, None])[:, 0]
         for camera, rig_from_cam in enumerate(state.rig_from_cam):
@@ -127,7 +127,7 @@ def _neighbourhoods(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[_Sh
     single = np.bincount(track, minlength=tracks) == 1
     points_m, goes_on = mapper.state.points_m[track], ~single[track]
     asked = np.flatnonzero(images > 1)
-    asked = asked[_off_the_ground(points_m[asked], path)]
+    asked = asked[_off_the_ground(points_m[asked], path, threads=mapper.config.threads)]
     asked = asked[_seen_by_next(mapper, points_m[asked], unit[asked])]
     begins = np.searchsorted(unit, np.arange(units + 1))
     first = np.searchsorted(unit[asked], np.arange(units + 1))

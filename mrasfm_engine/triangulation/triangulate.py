@@ -23,6 +23,7 @@ from mrasfm_engine.triangulation.kernels import (
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 from mrasfm_engine.types import Bools, Floats, Ints
 
+FEW_ERRORS = 4096  # take less time than to wake another thread
 ALL_BANDS = 4096  # up to so many, the poses of all are computed at once; rolling shutters have hundreds a unit
 
 
@@ -128,7 +129,7 @@ class Triangulator:
         """Reprojection errors (n,) of keypoints `rows` (n,) against points `point` (n,) of points_m; 1e6 behind."""
         posed, out = self._posed(state, rows), np.empty(len(rows))
         in_ranges(
-            self._threads,
+            1 if len(rows) < FEW_ERRORS else self._threads,
             len(rows),
             lambda lo, hi: reprojection_errors2(rows[lo:hi], point[lo:hi], posed, points_m, out[lo:hi]),
         )
