@@ -252,14 +252,12 @@ def warm_up(
     )
     images = len(few.images)
     bands = RowBands.from_drive(few, compensate=run.config.mapping.motion_compensation)
-    sound = [pair for pair in matches if pair.image_b < images]
-    keypoints, pairs = Keypoints.from_matches(few, features[:images], sound, bands)
+    among_them = [pair for pair in matches if pair.image_b < images]
+    keypoints, pairs = Keypoints.from_matches(few, features[:images], among_them, bands)
     known = prior_trajectory(few, run.config.gnss, use_gnss=prior.gnss is not None)
-    absolute = AbsolutePriors.from_trajectory(known)
+    poses, absolute = known.world_from_rig, AbsolutePriors.from_trajectory(known)
     try:
-        mapped = components.map_drive(
-            few, keypoints, pairs, known.world_from_rig, run.config, absolute=absolute, cancel=run.cancel
-        )
+        mapped = components.map_drive(few, keypoints, pairs, poses, run.config, absolute=absolute, cancel=run.cancel)
         refine(mapped[0].mapper, AbsolutePriors.from_trajectory(known), cancel=run.cancel)
     except CancelledError:
         raise
