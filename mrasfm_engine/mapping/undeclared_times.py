@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
+from mrasfm_engine.bundle_adjustment.marginal_covariances import MAX_UNKNOWNS_FOR_COVARIANCE, covariances
 from mrasfm_engine.bundle_adjustment.priors import ReadoutPrior, Term, TimePrior
 from mrasfm_engine.bundle_adjustment.problem import TIME, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
@@ -172,6 +172,8 @@ class _LateImages:
             cancel=cancel,
         )
         problem, offset_s = self._problem(with_readouts=True), self.mapper.state.camera_time_offset_s
+        if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
+            return None
         certainty = covariances(problem, problem.state)
         found = assess_times(self.prior, certainty, interpolation_error_s(self.mapper), offset_s)
         return None if found is None else (offset_s, found.sigma_s)
