@@ -142,6 +142,7 @@ def require_images_as_listed(
     looked_at = {**_unlinked(drive, pairs), **contradicted}
     if not looked_at:
         return None
+    sigma_rad, sigma_m = calibration_sigmas(drive, calibration)
     searches = {
         cameras: RelistedImages(
             drive,
@@ -151,6 +152,7 @@ def require_images_as_listed(
             cameras=cameras,
             units=(some := run.evenly(SEARCHED_UNITS)).units,
             listed_share=some.share,
+            sigma_translation_m=sigma_m[list(cameras)],
             cancel=cancel,
         )
         for cameras, run in looked_at.items()
@@ -167,7 +169,6 @@ def require_images_as_listed(
             agree = _that_agree(compared, but=lags)
             spans = {cameras: _span(drive, compared[cameras], contradicted[cameras]) for cameras in lags}
             raise _late(drive, lags, agree, spans)
-        sigma_rad = calibration_sigmas(drive, calibration)[0]
         for cameras in looked_at:
             # A turn of less is left to the calibration's own estimate, whose prior is some degrees.
             least_deg = np.degrees(largest_turn_rad(*sigma_rad[list(cameras)]))
@@ -179,6 +180,7 @@ def require_images_as_listed(
             cameras: compared[cameras].share
             for cameras in contradicted
             if compared[cameras].share < CLEARLY_GIVEN
+            and not searches[cameras].places_explain
             and (compared[cameras].wide_view or searches[cameras].see_the_same())
         }
     return _unexplained(drive, shares, _that_agree(compared, but=shares)) if shares else None

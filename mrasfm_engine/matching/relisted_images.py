@@ -14,7 +14,13 @@ from mrasfm_engine.even_choice import nearest_even_choice
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.geometry.neighbours import nearest
-from mrasfm_engine.matching.calibration_check import CLEARLY_BETTER, CLEARLY_WORSE, MIN_INLIERS, PAIR_ERROR_PX
+from mrasfm_engine.matching.calibration_check import (
+    CLEARLY_BETTER,
+    CLEARLY_WORSE,
+    MIN_INLIERS,
+    PAIR_ERROR_PX,
+    share_explained,
+)
 from mrasfm_engine.matching.prepared_images import Matcher, PreparedImages
 from mrasfm_engine.matching.simultaneous import max_error_rad
 from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, relative_pose
@@ -28,6 +34,9 @@ MAX_LAG = 5  # frames that images are late as a rule: all of these are looked at
 # is looked at in some units: images that are a frame apart or two show much the same.
 FARTHEST_LAG, LAG_STEP, SCANNED_UNITS = 60, 3, 4
 LEFT_SHARE = 0.33  # of the matches that contradict the calibration, at most so many still do in the right frames
+BASELINE_SIGMAS = 3.0  # of the given places, by which the baseline of two cameras may point elsewhere than given
+BASELINE_ROUNDS = 10  # of least squares with weights by residuals, of three unknowns
+MAX_BASELINE_ERROR = 0.5  # sine of 30 deg: a baseline that is farther from the given one is that of other frames
 # What is drawn into all images of a camera, as the time of day, is at one place in most of them.
 DRAWN_PX, DRAWN_SHARE = 1.5, 0.5
 
@@ -59,6 +68,8 @@ class RelistedImages:
         Some units (n,) in which the images contradict the calibration.
     listed_share
         Share of the matches there that fits it.
+    sigma_translation_m
+        Standard deviations (2,) of each axis of both cameras' places.
     """
 
     def __init__(
@@ -71,11 +82,15 @@ class RelistedImages:
         cameras: tuple[int, int],
         units: Ints,
         listed_share: float,
+        sigma_translation_m: Floats,
         cancel: Cancel | None = None,
     ) -> None:
         self._drive, self._matcher, self._config, self._cancel = drive, matcher, config, cancel
         self._cameras, self._units, self._listed_share = cameras, units, listed_share
         self._rig = drive.rig_from_cam[list(cameras)]
+        baseline_m = float(np.linalg.norm(np.diff(self._rig[:, :3, 3], axis=0)))
+        error_m = BASELINE_SIGMAS * float(np.linalg.norm(sigma_translation_m))
+        self._baseline_error = min(error_m / max(baseline_m, 1e-9), MAX_BASELINE_ERROR)
         self._focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(1)
         self._gate = PAIR_ERROR_PX / float(self._focal_px[list(cameras)].min())
         self._where = {(image.unit, image.camera): i for i, image in enumerate(drive.images)}
@@ -86,11 +101,13 @@ class RelistedImages:
     def lag(self) -> int:
         """Frames by which the second camera's images come after those of the first that they fit; 0 for none.
 
-        They have to fit well there, and far better than as they are listed.
+        They have to fit well there, and far better than as they are listed. Where a camera comes to the place that
+        another one had some frames before, their images have next to no parallax and fit any baseline. So matches as
+        they are listed have to contradict each baseline that the places' uncertainty allows.
         """
         shares = self._shares(range(-MAX_LAG, MAX_LAG + 1))
         listed_share = shares.pop(0, self._listed_share)
-        if listed_share >= CLEARLY_BETTER:
+        if listed_share >= CLEARLY_BETTER or self.places_explain:
             return 0
         lag = _best(shares, listed_share)
         if lag == 0 and listed_share < CLEARLY_WORSE and (far := self._scan()):
@@ -113,6 +130,19 @@ class RelistedImages:
     def share_as_given(self) -> float:
         """Median share of the matches of frames that list them that fits the calibration as given; 0 without any."""
         return float(np.median([self._near(rays).mean() for rays in self._listed])) if self._listed else 0.0
+
+    @cached_property
+    def places_explain(self) -> bool:
+        """True where one baseline near the given one explains the matches of the frames that list them."""
+        if not self._listed:
+            return False
+        given = se3.inverse(self._rig[1]) @ self._rig[0]
+        a, b = (np.concatenate(rays) for rays in zip(*((one.a, one.b) for one in self._listed), strict=True))
+        shown = given.copy()
+        shown[:3, 3] = _common_baseline(given, a, b, self._gate)
+        across_m, along_m = (float(np.linalg.norm(v)) for v in (np.cross(shown[:3, 3], given[:3, 3]), given[:3, 3]))
+        shares = [share_explained(shown, np.eye(4), one.a, one.b, self._gate) for one in self._listed]
+        return bool(across_m <= self._baseline_error * along_m and np.median(shares) >= CLEARLY_BETTER)
 
     def see_the_same(self) -> bool:
         """True where images of the frames that list them have matches besides those of what is drawn into them."""
@@ -202,6 +232,23 @@ def _without_drawn(units: Sequence[_Rays]) -> list[_Rays]:
             moves &= np.mean([np.zeros(len(of)), *there], axis=0) < DRAWN_SHARE
         if moves.sum() >= MIN_INLIERS:
             result.append(one.at(moves))
+    return result
+
+
+def _common_baseline(b_from_a: Floats, rays_a: Floats, rays_b: Floats, gate: float) -> Floats:
+    """Direction (3,) of the baseline that most matches agree with under the given rotation.
+
+    It is perpendicular to the normals of the planes that both rays of a match span. It begins at the given one, and is
+    turned around where it would be opposite to it.
+    """
+    in_b = rays_a @ b_from_a[:3, :3].T
+    normals = np.cross(in_b, rays_b)
+    pose = b_from_a.copy()
+    for _ in range(BASELINE_ROUNDS):
+        sine = np.linalg.norm(np.cross(pose[:3, 3], in_b), axis=1) / max(float(np.linalg.norm(pose[:3, 3])), 1e-9)
+        weights = 1.0 / np.maximum(sine, 1e-3) ** 2 / (1.0 + (epipolar_errors(pose, rays_a, rays_b) / gate) ** 2)
+        pose[:3, 3] = np.linalg.eigh((normals * weights[:, None]).T @ normals)[1][:, 0]
+    result: Floats = pose[:3, 3] * (1.0 if pose[:3, 3] @ b_from_a[:3, 3] >= 0 else -1.0)
     return result
 
 

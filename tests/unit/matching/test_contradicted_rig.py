@@ -206,6 +206,19 @@ def test_cameras_behind_each_other_that_look_aside_into_open_country_pass(apart_
     assert street(true=true, given=given, points=far, noise_px=0.7, turn_deg=0.3).check() is None
 
 
+@pytest.mark.parametrize("off_m", [0.09, -0.09])
+def test_a_camera_that_comes_to_the_place_of_another_one_is_not_late(off_m: float) -> None:
+    """Two frames later it sees what the other one saw, without parallax, and its wrong height no longer shows."""
+    rng = np.random.default_rng(3)
+    left = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    true = se3.transform(np.tile(left, (2, 1, 1)), [[1.5, 0.6, 1.5], [0.6, 0.6, 1.5]])
+    given = true.copy()
+    given[1, 2, 3] += off_m
+    x, y, z = rng.uniform(-8, 16, POINTS), rng.uniform(3, 9, POINTS), rng.uniform(-1, 6, POINTS)
+    points = np.stack([x, y, z], 1)
+    assert street(true=true, given=given, points=points, speed_m=0.45, turn_deg=0.05).check() is None
+
+
 def test_one_frame_that_is_late_is_left_to_the_mapping() -> None:
     assert street(late=1, lag=1, late_units=range(6, 8)).check() is None
 
