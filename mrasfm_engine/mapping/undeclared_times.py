@@ -1,8 +1,8 @@
 """Cameras whose images were taken at another time than those that the manifest says were taken with them.
 
 Where all images of a frame have one timestamp, cameras have no time offsets in the adjustment. One that is late comes
-out as mounted elsewhere along the way, and bends the trajectory. Where one has moved so, one Gauss-Newton step from the
-adjusted scene, in which offsets vary beside everything else, says which would leave zero [a score test: Rao,
+out as mounted elsewhere along the way, or hardly fits, and bends the trajectory. Where one does, one Gauss-Newton step
+from the adjusted scene, in which offsets vary beside everything else, says which would leave zero [a score test: Rao,
 Mathematical Proceedings of the Cambridge Philosophical Society 1948]. Where one would by more than clocks err, a copy
 of the scene is adjusted with the offsets, and says how late the camera is, and how certain that is: its residuals no
 longer have what the offset makes of them.
@@ -36,8 +36,9 @@ from mrasfm_engine.mapping.vehicle_speed import speeds_mps
 from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.findings import Finding, warning
 
-PART = 0.5  # of the way that a late camera seems to be displaced by, which its place has at least taken,
-HELD = 2.0  # or so many sigmas of its prior
+# Least signs of a late camera: half of the way by which it seems to be displaced, two sigmas of its place's prior, or
+# half of the share of keypoints that fits of the others.
+PART, HELD = 0.5, 2.0
 
 
 def undeclared_time_findings(
@@ -53,7 +54,7 @@ def undeclared_time_findings(
     usual_s = mapper.config.bundle_adjustment.sigma_time_offset_us / 1e6
     if len(mapper.camera_kind) == 2:
         usual_s /= np.sqrt(2.0)  # of half of what both are apart
-    if not (_is_open(mapper) and _seems_displaced(mapper, BEYOND_PRIOR_SIGMAS * usual_s)):
+    if not (_is_open(mapper) and _may_be_late(mapper, BEYOND_PRIOR_SIGMAS * usual_s)):
         return []
     scene = _LateImages.from_adjusted(mapper, free_units, terms, options)
     first_s = scene.first_step_s()
@@ -68,7 +69,7 @@ def undeclared_time_findings(
     if len(names) == 2:
         return [_pair_finding(names, float(np.ptp(offset_s)), 2.0 * float(sigma_s[0]))] if is_late.any() else []
     late: Sequence[int] = np.flatnonzero(is_late).tolist()
-    return [_finding(names[c], float(off_s[c]), float(sigma_s[c])) for c in late]
+    return [_finding(names[c], float(off_s[c]), float(sigma_s[c]), interval_s=_interval_s(mapper)) for c in late]
 
 
 def _is_open(mapper: Mapper) -> bool:
@@ -85,8 +86,9 @@ def _is_open(mapper: Mapper) -> bool:
     )
 
 
-def _seems_displaced(mapper: Mapper, least_s: float) -> bool:
-    """True where a camera has moved along the way as a late one would, by part of that or until its prior held it.
+def _may_be_late(mapper: Mapper, least_s: float) -> bool:
+    """True where a camera has moved along the way as a late one would, by part of that or until its prior held it; or
+    where its observations do not fit the others' poses.
 
     It takes next to no time, and spares most drives the rest.
     """
@@ -96,7 +98,23 @@ def _seems_displaced(mapper: Mapper, least_s: float) -> bool:
     prior = calibration_prior(mapper)
     along_m = np.abs(_among_others(prior.corrections(mapper.state)[:, 3:] @ way))
     least_m = np.minimum(PART * np.median(speeds_mps(mapper)) * least_s, HELD * prior.sigma_translation_m)
-    return bool((along_m > least_m).any())
+    share = _share_that_fits(mapper)
+    return bool((along_m > least_m).any() or (share < PART * np.median(share)).any())
+
+
+def _share_that_fits(mapper: Mapper) -> Floats:
+    """Share (c,) of each camera's keypoints on tracks that observe a point; one of those without any."""
+    cameras = len(mapper.camera_kind)
+    tracked = (mapper.tracks.of_keypoint >= 0) & mapper.registered[mapper.keypoints.unit]
+    seen, fits = (
+        np.bincount(mapper.keypoints.camera[which], minlength=cameras) for which in (tracked, mapper.is_inlier)
+    )
+    return np.where(seen > 0, fits / np.maximum(seen, 1), 1.0)
+
+
+def _interval_s(mapper: Mapper) -> float:
+    """Time between units, as a rule."""
+    return float(np.median(np.diff(mapper.drive.timestamps_us[mapper.registered]))) / 1e6
 
 
 def _among_others(offset: Floats) -> Floats:
@@ -126,9 +144,8 @@ class _LateImages:
         own.state = replace(mapper.state, points_m=mapper.state.points_m.copy())
         own.place_bands()
         cameras = len(mapper.camera_kind)
-        interval_s = float(np.median(np.diff(mapper.drive.timestamps_us[mapper.registered]))) / 1e6
         prior = TimePrior(
-            sigma_s=np.full(cameras, interval_s),
+            sigma_s=np.full(cameras, _interval_s(mapper)),
             held=np.zeros(cameras, dtype=np.bool_),
             gauge_weights=np.ones(cameras),
         )
@@ -179,13 +196,16 @@ class _LateImages:
         return None if found is None else (offset_s, found.sigma_s)
 
 
-def _finding(name: str, late_s: float, sigma_s: float) -> Finding:
+def _finding(name: str, late_s: float, sigma_s: float, *, interval_s: float) -> Finding:
+    frames = round(abs(late_s) / interval_s)
+    where = f"{frames} frame{'s' if frames > 1 else ''} {'later' if late_s > 0 else 'earlier'}"
+    elsewhere = f" It may be that they belong {where}." if frames else ""
     return warning(
         "time-offset-undeclared",
         f"images of camera {name} were taken {1e3 * late_s:+.1f} ms from those of the other cameras (sigma "
         f"{1e3 * sigma_s:.1f} ms), and have the same timestamps: the scene is bent by it",
         "Declare sigma_time_offset_us of the camera, and its offset is estimated with the scene; or give its images "
-        "their own timestamp_us.",
+        f"their own timestamp_us.{elsewhere}",
     )
 
 

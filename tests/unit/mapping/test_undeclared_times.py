@@ -60,6 +60,12 @@ def test_a_late_camera_is_named_with_its_offset_and_with_the_field_that_lets_it_
     assert "sigma_time_offset_us" in said.remedy
 
 
+@pytest.mark.parametrize(("late_ms", "where"), [(100, "1 frame later"), (-100, "1 frame earlier"), (40, "")])
+def test_images_that_belong_to_another_frame_are_told_to_which(late_ms: int, where: str) -> None:
+    (said,) = findings([0, 0, late_ms, 0])
+    assert said.remedy.partition("they belong ")[2] == (where and f"{where}.")
+
+
 def test_of_two_cameras_both_are_named() -> None:
     (said,) = findings([0, 30], sigma_m=0.1)
     assert said.code == "time-offset-undeclared"
