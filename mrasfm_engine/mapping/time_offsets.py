@@ -51,16 +51,20 @@ class TimeCertainty:
     to_hold: Bools
 
 
-def times_may_vary(mapper: Mapper) -> bool:
-    """True where settings and drive allow time offsets."""
+def times_can_be_told(mapper: Mapper) -> bool:
+    """True where settings and rig allow time offsets, if images are not taken at once."""
     settings = mapper.config.bundle_adjustment
     return (
         settings.refine_time_offsets
         and settings.priors
         and settings.camera_set_adjustment
-        and not mapper.state.simultaneous
         and not mapper.drive.has_single_camera
     )
+
+
+def times_may_vary(mapper: Mapper) -> bool:
+    """True where settings and drive allow time offsets."""
+    return times_can_be_told(mapper) and not mapper.state.simultaneous
 
 
 def time_prior(mapper: Mapper, *, mean_varies: bool, held: Bools | None = None) -> TimePrior:

@@ -30,6 +30,7 @@ from mrasfm_engine.mapping.time_offsets import (
     SIGMA_READOUT_S,
     assess_times,
     interpolation_error_s,
+    times_can_be_told,
     undeclared_readouts,
 )
 from mrasfm_engine.mapping.vehicle_speed import speeds_mps
@@ -74,14 +75,10 @@ def undeclared_time_findings(
 
 def _is_open(mapper: Mapper) -> bool:
     """True where nothing lets offsets vary, although settings and drive would allow to tell them."""
-    settings = mapper.config.bundle_adjustment
     return (
-        settings.refine_time_offsets
-        and settings.priors
-        and settings.camera_set_adjustment
+        times_can_be_told(mapper)
         and mapper.config.mapping.motion_compensation
         and mapper.state.simultaneous
-        and not mapper.drive.has_single_camera
         and not has_few_units(mapper)
     )
 

@@ -87,8 +87,9 @@ class RelistedImages:
     ) -> None:
         self._drive, self._matcher, self._config, self._cancel = drive, matcher, config, cancel
         self._cameras, self._units, self._listed_share = cameras, units, listed_share
-        self._rig = drive.rig_from_cam[list(cameras)]
-        baseline_m = float(np.linalg.norm(np.diff(self._rig[:, :3, 3], axis=0)))
+        rig_from_a, rig_from_b = drive.rig_from_cam[list(cameras)]
+        self._given = se3.inverse(rig_from_b) @ rig_from_a  # b_from_a
+        baseline_m = float(np.linalg.norm(self._given[:3, 3]))
         error_m = BASELINE_SIGMAS * float(np.linalg.norm(sigma_translation_m))
         self._baseline_error = min(error_m / max(baseline_m, 1e-9), MAX_BASELINE_ERROR)
         self._focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(1)
@@ -124,8 +125,7 @@ class RelistedImages:
         b_from_a = _common_rotation([one.a for one in rays], [one.b for one in rays], max_error)
         if b_from_a is None:
             return 0.0
-        given = self._rig[1, :3, :3].T @ self._rig[0, :3, :3]
-        return float(se3.rotation_angle_deg(given.T @ b_from_a))
+        return float(se3.rotation_angle_deg(self._given[:3, :3].T @ b_from_a))
 
     def share_as_given(self) -> float:
         """Median share of the matches of frames that list them that fits the calibration as given; 0 without any."""
@@ -136,9 +136,8 @@ class RelistedImages:
         """True where one baseline near the given one explains the matches of the frames that list them."""
         if not self._listed:
             return False
-        given = se3.inverse(self._rig[1]) @ self._rig[0]
+        given, shown = self._given, self._given.copy()
         a, b = (np.concatenate(rays) for rays in zip(*((one.a, one.b) for one in self._listed), strict=True))
-        shown = given.copy()
         shown[:3, 3] = _common_baseline(given, a, b, self._gate)
         across_m, along_m = (float(np.linalg.norm(v)) for v in (np.cross(shown[:3, 3], given[:3, 3]), given[:3, 3]))
         shares = [share_explained(shown, np.eye(4), one.a, one.b, self._gate) for one in self._listed]
@@ -190,7 +189,7 @@ class RelistedImages:
 
     def _near(self, rays: _Rays) -> Bools:
         """Matches (n,) that lie near their epipolar lines."""
-        near: Bools = epipolar_errors(se3.inverse(self._rig[1]) @ self._rig[0], rays.a, rays.b) < self._gate
+        near: Bools = epipolar_errors(self._given, rays.a, rays.b) < self._gate
         return near
 
     def _verified(self, image_a: int, image_b: int) -> _Rays | None:

@@ -119,14 +119,20 @@ def without_positions(data: Path, work: Path) -> Iterator[Figure]:
         assert refinement.certainty is not None
         found.append((camera_errors(mapper, drive) / refinement.certainty.sigma_camera[:, :6]).reshape(-1, 2, 3))
     for k, what in enumerate(("rotations", "translations")):
-        values = np.concatenate([one[:, k] for one in found])
-        yield Figure(
-            line="19c",
-            what=f"{SIMULATED_WITHOUT_GNSS} simulated drives without GNSS: {what}, errors over their sigmas, RMS",
-            value=float(np.sqrt(np.mean(np.square(values)))),
-            above=LEAST_SIMULATED,
-            most=MOST_SIMULATED,
-        )
+        title = f"{SIMULATED_WITHOUT_GNSS} simulated drives without GNSS: {what}"
+        yield _rms_in_sigmas("19c", title, [one[:, k] for one in found])
+
+
+def _rms_in_sigmas(line: str, title: str, errors: list[np.ndarray]) -> Figure:
+    """Errors over their sigmas of all simulated drives together."""
+    values = np.concatenate([np.ravel(one) for one in errors])
+    return Figure(
+        line=line,
+        what=f"{title}, errors over their sigmas, RMS",
+        value=float(np.sqrt(np.mean(np.square(values)))),
+        above=LEAST_SIMULATED,
+        most=MOST_SIMULATED,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -145,14 +151,7 @@ def simulated(data: Path, work: Path) -> Iterator[Figure]:
     del data, work  # there are no files
     found = [_in_sigmas(seed, CAMERAS[seed % len(CAMERAS)]) for seed in range(SIMULATED)]
     for what in ("scale", "positions", "rotations", "translations"):
-        values = np.concatenate([np.ravel(getattr(one, what)) for one in found])
-        yield Figure(
-            line="19b",
-            what=f"{SIMULATED} simulated drives: {what}, errors over their sigmas, RMS",
-            value=float(np.sqrt(np.mean(np.square(values)))),
-            above=LEAST_SIMULATED,
-            most=MOST_SIMULATED,
-        )
+        yield _rms_in_sigmas("19b", f"{SIMULATED} simulated drives: {what}", [getattr(one, what) for one in found])
     yield Figure(
         line="19b",
         what=f"{SIMULATED} simulated drives: sigmas of cameras over those of the exact geometry, worst drive",
