@@ -14,7 +14,6 @@ from typing import Any, NoReturn
 
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import colmap_io, comparisons, readers
-from mrasfm_engine.export.colmap import text_model_fits
 from mrasfm_engine.export.comparisons import Rows
 from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.export.picture_files import LargeFile, PictureFiles
@@ -41,23 +40,28 @@ class Check:
     compare: Callable[[Any], Rows]
 
 
-def binary_model_checks(scene: Scene) -> list[Check]:
-    """Checks of the binary model; the text model is made of it."""
+def binary_model_checks(
+    scene: Scene, read: Callable[[Path], colmap_io.ModelRead] = colmap_io.read_binary
+) -> list[Check]:
+    """Checks of the binary model, which COLMAP reads by `read`; the text model is made of it."""
     return [
         Check("model/images.bin", readers.images_binary, partial(comparisons.images, scene)),
-        Check("model", colmap_io.read_binary, partial(comparisons.model, scene)),
+        Check("model", read, partial(comparisons.model, scene)),
+    ]
+
+
+def text_model_checks(scene: Scene) -> list[Check]:
+    """Checks of the text model."""
+    return [
+        Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
+        Check("model/text/points3D.txt", readers.points_text, partial(comparisons.points_text, scene)),
+        Check("model/text", colmap_io.read_text, partial(comparisons.model, scene)),
     ]
 
 
 def common_checks(scene: Scene) -> list[Check]:
     """Checks of the other files that scenes and maps have alike, but for those of `completing_checks`."""
-    text = [
-        Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
-        Check("model/text/points3D.txt", readers.points_text, partial(comparisons.points_text, scene)),
-        Check("model/text", colmap_io.read_text, partial(comparisons.model, scene)),
-    ]
     return [
-        *(text if text_model_fits(scene) else []),
         Check("points.ply", readers.ply, partial(comparisons.ply, scene)),
         Check("frame.json", readers.json_object, partial(comparisons.frame, scene)),
         Check("poses.json", readers.json_object, partial(comparisons.poses, scene)),
@@ -79,7 +83,7 @@ def _picture_check(name: str, data: bytes | LargeFile) -> Check:
 
 
 class ReadBack:
-    """The files of one folder, as far as they have been read back."""
+    """The files of one folder, as far as they have been read back; several threads may read different ones."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -137,7 +141,7 @@ class ReadBack:
 
     def _expected_in(self, file: str) -> list[str]:
         """Files with a content that is not yet compared which a check of a file or folder reads."""
-        return [name for name in self._contents if file in (name, PurePosixPath(name).parent.as_posix())]
+        return [name for name in list(self._contents) if file in (name, PurePosixPath(name).parent.as_posix())]
 
     def require_all(self) -> None:
         """Refuse a folder that holds a file which no check has read.

@@ -79,16 +79,25 @@ def read_text(folder: Path) -> ModelRead:
     return _read(folder, TEXT_FILES, _read_text)
 
 
-def write_text(binary_folder: Path, folder: Path) -> dict[str, str]:
-    """Write the text model of a binary one into an existing folder; the SHA-256 of its files by name."""
-    return _by_itself(_write_text, binary_folder, folder, size_bytes=_size_bytes(binary_folder, BINARY_FILES))
+def read_binary_and_write_text(binary_folder: Path, folder: Path) -> tuple[ModelRead, dict[str, str]]:
+    """A binary model as COLMAP reads it, and the SHA-256 of the files, by name, of its text model in another folder.
+
+    COLMAP reads the model once for both.
+    """
+    _require_files(binary_folder, BINARY_FILES)
+    size_bytes = _size_bytes(binary_folder, BINARY_FILES)
+    return _by_itself(_read_binary_and_write_text, binary_folder, folder, size_bytes=size_bytes)
 
 
 def _read(folder: Path, names: Sequence[str], read: Callable[[Path], ModelRead]) -> ModelRead:
+    _require_files(folder, names)
+    return _by_itself(read, folder, size_bytes=_size_bytes(folder, names))
+
+
+def _require_files(folder: Path, names: Sequence[str]) -> None:
     for name in names:
         if not (folder / name).stat().st_size:  # without its file of rigs, COLMAP makes some up
             raise ValueError(f"{name} is empty")
-    return _by_itself(read, folder, size_bytes=_size_bytes(folder, names))
 
 
 def _size_bytes(folder: Path, names: Sequence[str]) -> int:
@@ -129,9 +138,11 @@ def _result_or_error(
         return error
 
 
-def _write_text(binary_folder: Path, folder: Path) -> dict[str, str]:
-    pycolmap.Reconstruction(str(binary_folder)).write_text(str(folder))
-    return {name: sha256(folder / name) for name in TEXT_FILES}
+def _read_binary_and_write_text(binary_folder: Path, folder: Path) -> tuple[ModelRead, dict[str, str]]:
+    model = pycolmap.Reconstruction()
+    model.read_binary(str(binary_folder))
+    model.write_text(str(folder))
+    return _read_of(model), {name: sha256(folder / name) for name in TEXT_FILES}
 
 
 def _read_binary(folder: Path) -> ModelRead:

@@ -36,7 +36,14 @@ from mrasfm_engine.export import (
     readers,
     road,
 )
-from mrasfm_engine.export.check import Check, ReadBack, binary_model_checks, common_checks, completing_checks
+from mrasfm_engine.export.check import (
+    Check,
+    ReadBack,
+    binary_model_checks,
+    common_checks,
+    completing_checks,
+    text_model_checks,
+)
 from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
@@ -198,7 +205,29 @@ def _write_beside_pictures(
     CancelledError
         Between two files, once `stopped` is set.
     """
-    figures = write_common(scene, work, read_back)
+    figures = _write_model(scene, work, read_back)
+    # COLMAP reads and writes for half of the time, in processes of its own.
+    with ThreadPoolExecutor(1) as pool:
+        of_model = pool.submit(_check_model, scene, work, read_back, partial(_require_going_on, stopped))
+        try:
+            calibrated = _write_others(scene, work, parts, component, read_back, stopped, figures)
+        except BaseException:
+            stopped.set()
+            raise
+        of_model.result()
+    return figures, calibrated
+
+
+def _write_others(
+    scene: Scene,
+    work: Path,
+    parts: _Parts,
+    component: int,
+    read_back: ReadBack,
+    stopped: Event,
+    figures: dict[str, Any],
+) -> dict[str, Any]:
+    """Write and read the other files but the model and the points; `calibration.json`."""
     _require_going_on(stopped)
     names = [scene.drive.manifest.name] * len(scene.unit_registered)
     others = Interchange(scene=scene, scene_of_unit=names, rigs={RIG_FOLDER: ""})
@@ -221,7 +250,7 @@ def _write_beside_pictures(
     for check in _checks(scene):
         _require_going_on(stopped)
         read_back.check([check])
-    return figures, calibrated
+    return calibrated
 
 
 def _require_going_on(stopped: Event) -> None:
@@ -231,18 +260,40 @@ def _require_going_on(stopped: Event) -> None:
 
 def write_common(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any]:
     """Write what scenes and maps have alike: model and points; the figures of `report.json`'s `summary`."""
+    figures = _write_model(scene, work, read_back)
+    _check_model(scene, work, read_back)
+    return figures
+
+
+def _write_model(scene: Scene, work: Path, read_back: ReadBack) -> dict[str, Any]:
+    """Write the binary model and the points; the report's `summary`."""
     model, figures = work / "model", summary(scene)
     model.mkdir()
     read_back.expect({f"model/{name}": digest for name, digest in colmap.write_model(scene, model).items()})
-    read_back.check(binary_model_checks(scene))
-    if colmap.text_model_fits(scene):
-        (model / "text").mkdir()
-        text = colmap_io.write_text(model, model / "text")
-        read_back.expect({f"model/text/{name}": digest for name, digest in text.items()})
-    else:
+    if not colmap.text_model_fits(scene):
         figures["notes"].append("model/text is withheld: COLMAP's text format cannot hold image names with spaces")
     read_back.expect({"points.ply": ply.write_ply(scene, work / "points.ply")})
     return figures
+
+
+def _check_model(
+    scene: Scene, work: Path, read_back: ReadBack, require_going_on: Callable[[], None] = lambda: None
+) -> None:
+    """Read the binary model, and let COLMAP make the text model of it, which is read too."""
+    if not colmap.text_model_fits(scene):
+        read_back.check(binary_model_checks(scene))
+        return
+    text = work / "model" / "text"
+
+    def read_and_translate(folder: Path) -> colmap_io.ModelRead:
+        text.mkdir()
+        found, digests = colmap_io.read_binary_and_write_text(folder, text)
+        read_back.expect({f"model/text/{name}": digest for name, digest in digests.items()})
+        return found
+
+    for check in (*binary_model_checks(scene, read_and_translate), *text_model_checks(scene)):
+        require_going_on()
+        read_back.check([check])
 
 
 def _checks(scene: Scene) -> list[Check]:

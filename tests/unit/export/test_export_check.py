@@ -57,9 +57,9 @@ def truncate(path: Path) -> None:
 
 
 def text_without_end(original: Any, binary: Path, folder: Path) -> Any:
-    digests = original(binary, folder)
+    written = original(binary, folder)
     truncate(folder / "images.txt")
-    return digests
+    return written
 
 
 def with_moved_rig(original: Any, scene: Scene) -> Any:
@@ -119,7 +119,7 @@ def tum_with_gap(original: Any, scene: Scene) -> str:
         ),
         (colmap, "_points", with_swapped_points, "model .*points3D: a point"),
         (colmap, "_points", lambda original, scene: b"", "model .*points3D.bin is empty"),
-        (colmap_io, "write_text", text_without_end, "images.txt"),
+        (colmap_io, "read_binary_and_write_text", text_without_end, "images.txt"),
         (ply, "write_ply", ply_without_end, "points.ply"),
         (ply, "write_ply", with_swapped_points, "points.ply"),
         (feature_database, "write_features", without_a_pair, "features.db"),

@@ -22,7 +22,7 @@ def lines(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> list[str]:
     folder = tmp_path_factory.mktemp("model")
     colmap.write_model(scene, folder)
     (folder / "text").mkdir()
-    colmap_io.write_text(folder, folder / "text")
+    colmap_io.read_binary_and_write_text(folder, folder / "text")
     return (folder / "text" / "points3D.txt").read_text(encoding="utf-8").splitlines(keepends=True)
 
 
