@@ -89,6 +89,8 @@ def calibrations(assembly: Assembly, model: MapModel) -> list[CameraCalibration]
             params=params_of(camera, params),
             sigma_rotation_deg=unknown,
             sigma_translation_m=unknown,
+            repeatability_rotation_deg=unknown,
+            repeatability_translation_m=unknown,
             sigma_focal_px=float("nan"),
             observed=np.zeros(6, dtype=np.bool_),
         )

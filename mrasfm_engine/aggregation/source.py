@@ -113,14 +113,16 @@ class SourceScene:
 
     @cached_property
     def certainty_of_cameras(self) -> tuple[Floats, Bools] | None:
-        """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, and which of them the drive
-        observed; None where the calibration was not refined, or how certain it is is not known.
+        """Sigmas (c, 6) of `rig_from_cam`, rotation (rad) and translation (m) in rig axes, without errors that drives
+        with the same intrinsics share, and which of them the drive observed; None where the calibration was not
+        refined, or how certain it is is not known.
         """
         found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
-        known_of_all = all({"rotation_deg", "translation_m"} <= camera["sigma"].keys() for camera in found)
+        stated = [camera.get("repeatability", camera["sigma"]) for camera in found]  # older scenes have sigmas alone
+        known_of_all = all({"rotation_deg", "translation_m"} <= sigmas.keys() for sigmas in stated)
         if self.calibration.get("adjusted") is not True or not known_of_all:
             return None
-        sigma = [[*np.radians(c["sigma"]["rotation_deg"]), *c["sigma"]["translation_m"]] for c in found]
+        sigma = [[*np.radians(sigmas["rotation_deg"]), *sigmas["translation_m"]] for sigmas in stated]
         observed = [[*c["observed"]["rotation"], *c["observed"]["translation"]] for c in found]
         sigmas, known = np.array(sigma, dtype=np.float64), np.array(observed, dtype=np.bool_)
         if not sigmas.shape == known.shape == (len(found), 6) or not ((sigmas > 0) & np.isfinite(sigmas)).all():

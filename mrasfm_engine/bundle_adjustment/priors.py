@@ -296,6 +296,7 @@ class ScalePrior:
     sigma: float
     sigma_scale: float  # of the scale, by both these rotations and lens models
     sigma_of_corrections: float  # of what the corrections come to, by these rotations alone
+    share: float  # of the rotations as given in that; the rest follows images
 
     def log_scale_of(self, state: State) -> float:
         """Logarithm of the scale that the corrections come to."""

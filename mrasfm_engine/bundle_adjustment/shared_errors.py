@@ -76,10 +76,10 @@ def find_shared_errors(
     of_units, of_points = problem.scores(
         state, system, columns, number[problem.observations.unit], min(POINT_GROUPS, problem.observations.num_points)
     )
-    covariance = of_points.T @ of_points + _of_terms(problem, state, columns)
+    covariance = of_points.T @ of_points + information_of_terms(problem, state, columns)
     known = np.diagonal(covariance) > 0.0
     covariance[np.ix_(known, known)] = _widened(covariance[np.ix_(known, known)], of_units[:, known])
-    of_priors = _of_terms(replace(problem, terms=_known_beforehand(problem)), state, columns)
+    of_priors = information_of_terms(replace(problem, terms=_known_beforehand(problem)), state, columns)
     return SharedErrors(covariance, _best_sigma_factor(covariance, of_independent, of_priors))
 
 
@@ -155,8 +155,8 @@ def _widened(covariance: Floats, scores: Floats) -> Floats:
     return result
 
 
-def _of_terms(problem: Problem, state: State, columns: Floats) -> Floats:
-    """X' E X (k, k) of the columns X and the information E of all terms that are not image observations."""
+def information_of_terms(problem: Problem, state: State, columns: Floats) -> Floats:
+    """X' E X (k, k) of columns X (n, k) of the reduced vector and the information E of all terms, without images."""
     extra = Extra.none(problem.layout)
     for term in problem.terms:
         term.add_to(state, problem.layout, extra)

@@ -21,6 +21,8 @@ def calibration_document(scene: Scene, component: int = 0) -> dict[str, Any]:
 
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
+    `repeatability` is the sigma without errors that all images share, as those of lenses: other drives with the same
+    intrinsics err by the same.
     Where time offsets varied, `refined` has `time_offset_us`: images were taken so much later than their timestamps
     say, each camera's against the mean of all unless positions tell that too. Where intrinsics were asked for,
     `observed` and `verdict` have `focal`: of a focal length that the drive does not observe the given value is held.
@@ -102,6 +104,10 @@ def verdict_in_words(refined: CameraCalibration) -> list[str]:
     return [OBSERVED if observed else ONLY_PRIOR for observed in refined.observed]
 
 
+def _known(values: Mapping[str, Floats]) -> dict[str, Any]:
+    return {name: value.tolist() for name, value in values.items() if np.isfinite(value).all()}
+
+
 def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
     given = matrix_from_pose(camera.rig_from_cam)
     names = CAMERA_MODELS[camera.model]
@@ -111,6 +117,10 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         "rotation_deg": refined.sigma_rotation_deg,
         "translation_m": refined.sigma_translation_m,
         "focal_px": np.array(refined.sigma_focal_px),
+    }
+    repeatability = {
+        "rotation_deg": refined.repeatability_rotation_deg,
+        "translation_m": refined.repeatability_translation_m,
     }
     asked: dict[str, dict[str, Any]] = {"refined": {}, "observed": {}, "verdict": {}}
     if refined.focal_observed is not None:
@@ -136,7 +146,8 @@ def _camera(camera: Camera, refined: CameraCalibration) -> dict[str, Any]:
         | {
             "focal_px": float(np.mean([refined.params[k] - camera.params[k] for k in focal])),
         },
-        "sigma": {name: value.tolist() for name, value in sigma.items() if np.isfinite(value).all()},
+        "sigma": _known(sigma),
+        "repeatability": _known(repeatability),
         "observed": {"rotation": refined.observed[:3].tolist(), "translation": refined.observed[3:].tolist()}
         | asked["observed"],
         "verdict": {"rotation": words[:3], "translation": words[3:]} | asked["verdict"],

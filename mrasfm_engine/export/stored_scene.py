@@ -155,6 +155,8 @@ def _calibration(camera: Mapping[str, Any]) -> CameraCalibration:
         params=np.array(refined["params"], dtype=np.float64),
         sigma_rotation_deg=unknown,
         sigma_translation_m=unknown,
+        repeatability_rotation_deg=unknown,
+        repeatability_translation_m=unknown,
         sigma_focal_px=float("nan"),
         observed=np.zeros(6, dtype=np.bool_),
     )

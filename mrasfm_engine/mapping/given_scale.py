@@ -28,11 +28,10 @@ from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, ScalePrior, 
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import FISHEYE
+from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX, lens_sigmas
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
 
-LENS_SIGMA_PX = 0.5  # RMS over an image of what each parameter of a lens model is off by
 # Rotations are means over whole images of what lens models leave: about as many independent errors as parameters.
 PATTERNS = 10
 ROTATION_SIGMA_PX = LENS_SIGMA_PX / np.sqrt(PATTERNS)
@@ -56,7 +55,7 @@ def scale_of_given_rotations(
         Of the adjustment that follows, with the calibration's prior.
     """
     cameras = len(mapper.camera_kind)
-    lens = _lens_sigmas(mapper)
+    lens = _over_keypoints(mapper)
     nuisance = IntrinsicsPrior(params=mapper.state.camera_params, sigma=lens)
     problem, _ = mapper.problem(
         free_units,
@@ -101,6 +100,7 @@ def scale_of_given_rotations(
         sigma=np.inf,
         sigma_scale=of_free,
         sigma_of_corrections=0.0,
+        share=0.0,
     )
     found = images_alone.log_scale_of(mapper.state)
     # What contradicts the images by many sigmas is no estimate of the same scale [Geman and McClure's weight].
@@ -117,6 +117,7 @@ def scale_of_given_rotations(
         sigma=float(as_weighed * np.sqrt(pull)),
         sigma_scale=float(np.hypot(share * of_given, (1.0 - share) * of_free)),
         sigma_of_corrections=share * of_given,
+        share=share,
     )
 
 
@@ -159,24 +160,9 @@ def _rotation_sigma_px(moved_px: Floats, by_rotation: Floats) -> float:
     return float(np.sqrt(measured2 + expit(if_calibrated - if_measured) * (calibrated2 - measured2)))
 
 
-def _lens_sigmas(mapper: Mapper) -> Floats:
-    """Standard deviations (c, INTRINSICS) at which parameters move a camera's keypoints by `LENS_SIGMA_PX`, RMS."""
-    result = np.empty((len(mapper.camera_kind), INTRINSICS))
-    for c, params in enumerate(mapper.state.camera_params):
-        own = mapper.keypoints.camera == c
-        if not own.any():
-            result[c] = RIDGE  # no image of it shows anything: its lens takes no part
-            continue
-        x, y = ((mapper.keypoints.xy_px[own] - params[2:4]) / params[:2]).T
-        r2 = x**2 + y**2
-        if mapper.camera_kind[c] == FISHEYE:
-            across, ahead = mapper.keypoints.rays[own, :2], mapper.keypoints.rays[own, 2]
-            theta = np.arctan2(np.linalg.norm(across, axis=1), ahead)
-            distortion = [theta**3, theta**5, theta**7, theta**9]
-        else:
-            distortion = [r2**1.5, r2**2.5, *(np.hypot(2 * x * y, r2 + 2 * z**2) for z in (y, x))]
-        moved = np.array([r2**0.5, y, *distortion])
-        by_parameter = np.sqrt((moved**2).mean(axis=1)) * params[:2].mean()
-        by_parameter = np.insert(by_parameter, 2, [1.0, 1.0])  # the principal point's two, in pixels
-        result[c] = LENS_SIGMA_PX / np.maximum(by_parameter, 1e-6)
-    return result
+def _over_keypoints(mapper: Mapper) -> Floats:
+    """Usual sigmas (c, INTRINSICS) of lens parameters by where the drive's images show anything."""
+    keypoints, state = mapper.keypoints, mapper.state
+    by_camera = [keypoints.camera == c for c in range(len(mapper.camera_kind))]
+    cameras = zip(mapper.camera_kind.tolist(), state.camera_params, by_camera, strict=True)
+    return np.stack([lens_sigmas(k, p, keypoints.xy_px[own], keypoints.rays[own]) for k, p, own in cameras])

@@ -21,9 +21,10 @@ from mrasfm_engine.mapping.calibration import (
     scale_with_baselines,
 )
 from mrasfm_engine.mapping.dynamic_objects import find_moving_along, units_to_doubt, without_keypoints
-from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, turned_px
+from mrasfm_engine.mapping.given_scale import turned_px
 from mrasfm_engine.mapping.initialization import Initialisation, initialise
 from mrasfm_engine.mapping.keyframes import select_keyframes
+from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX
 from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses

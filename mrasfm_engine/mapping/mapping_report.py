@@ -199,6 +199,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
         },
         "sigma_observation_px": refinement.sigma_px,
         "sigma_factor_of_shared_errors": refinement.sigma_factor,
+        **_systematic(refinement),
         "adjustments": [_adjustment(r) for r in refinement.adjustments],
         "calibration": {
             "adjusted": refinement.calibration.free,
@@ -410,6 +411,11 @@ def _scale_source(mapper: Mapper, refinement: Refinement) -> str:
     if mapper.drive.has_single_camera:
         return "GNSS" if refinement.georeferenced else "rough poses"
     return "baselines of the rig and GNSS" if refinement.georeferenced else "baselines of the rig"
+
+
+def _systematic(refinement: Refinement) -> dict[str, Any]:
+    errors = refinement.systematic
+    return {} if errors is None else {"lens_errors_px": errors.lens_px, "factor_of_systematic_errors": errors.factor}
 
 
 def _adjustment(report: Report) -> dict[str, Any]:

@@ -43,6 +43,7 @@ from mrasfm_engine.mapping.refinement_result import (
     certainty_of,
     free_units_of,
     solver_options,
+    systematic_errors_of,
     terms_of,
 )
 from mrasfm_engine.mapping.refused_positions import compare_positions_again
@@ -156,6 +157,7 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
     """Say how certain everything is, hold what the drive does not observe, and find what is not as it was given."""
     _compare_rough_poses_with_rig(mapper, result)
     result.directions = observed_directions(mapper, result.certainty, placed=result.is_placed)
+    result.systematic = systematic_errors_of(mapper, result, free_units)
     mean_time_varied = result.mean_time_varies
     if result.times_vary and result.certainty is not None:
         result.mean_time_varies &= positions_tell_time(mapper, result.certainty)

@@ -24,6 +24,7 @@ from mrasfm_engine.mapping.moving_objects import MovingTracks
 from mrasfm_engine.mapping.other_sizes import Parts
 from mrasfm_engine.mapping.receiver_fit import Placement
 from mrasfm_engine.mapping.road import RoadAssessment
+from mrasfm_engine.mapping.systematic_errors import SystematicErrors, systematic_errors
 from mrasfm_engine.mapping.time_offsets import (
     SIGMA_READOUT_S,
     TimeCertainty,
@@ -62,6 +63,7 @@ class Refinement:
     points_dropped: int = 0
     units_dropped: list[int] = field(default_factory=list)
     certainty: Covariances | None = None
+    systematic: SystematicErrors | None = None  # what comes on top for the cameras; None where it is not known
     directions: Observability | None = None  # of the cameras' poses; None where it is not known
     held: Bools | None = None  # (cameras, 6) directions that were not observed and stay as given
     held_times: Bools | None = None  # (cameras,) time offsets that were not observed and stay zero
@@ -191,6 +193,24 @@ def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | Non
         options=solver_options(mapper, result),
     )
     return None if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE else problem
+
+
+def systematic_errors_of(mapper: Mapper, result: Refinement, free_units: Bools) -> SystematicErrors | None:
+    """Errors of the cameras that all images share, as those of lens models, which the certainty does not have.
+
+    None where cameras were held, and where intrinsics might vary: then their priors are in the certainty.
+    """
+    asked = result.intrinsics is not None and result.intrinsics.asked
+    if result.certainty is None or not result.calibration.free or asked:
+        return None
+    return systematic_errors(
+        mapper,
+        free_units=free_units & mapper.registered,
+        free_times=result.recalibrated if result.times_vary else None,
+        terms=[term for term in terms_of(mapper, result) if not isinstance(term, ScalePrior)],
+        given_scale=result.given_scale,
+        options=solver_options(mapper, result),
+    )
 
 
 def _with_errors_of_given_scale(mapper: Mapper, result: Refinement, certainty: Covariances) -> Covariances:

@@ -102,9 +102,12 @@ def _time_offset(mapper: Mapper, refinement: Refinement, camera: int) -> dict[st
     times = refinement.times
     if times is None:
         return {}
+    sigma_s, errors = times.sigma_s, refinement.systematic
+    if errors is not None:
+        sigma_s = errors.sigma_time_s(sigma_s)
     return {
         "time_offset_s": float(mapper.state.camera_time_offset_s[camera]),
-        "sigma_time_offset_s": float(times.sigma_s[camera]),
+        "sigma_time_offset_s": float(sigma_s[camera]),
         "time_offset_observed": bool(times.observed[camera]),
     }
 
@@ -125,6 +128,9 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
                 for c, p in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
             ]
             focal = refinement.certainty.sigma_camera[:, 6] * np.array(focal_px)
+    scatter = sigma
+    if refinement.systematic is not None:
+        sigma = np.where(refinement.recalibrated[:, None], refinement.systematic.sigma_camera(sigma), sigma)
     if refinement.directions is not None:
         observed = refinement.directions.observed & refinement.recalibrated[:, None]
     wrong = {w.camera for w in refinement.miscalibrations}
@@ -134,6 +140,8 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
             params=unpack_camera(camera.model, mapper.state.camera_params[c]),
             sigma_rotation_deg=np.degrees(sigma[c, :3]),
             sigma_translation_m=sigma[c, 3:],
+            repeatability_rotation_deg=np.degrees(scatter[c, :3]),
+            repeatability_translation_m=scatter[c, 3:],
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
             is_wrong=c in wrong,

@@ -88,6 +88,9 @@ class CameraCalibration:
     params: Floats  # COLMAP's order
     sigma_rotation_deg: Floats  # (3,) about the rig's axes, posterior
     sigma_translation_m: Floats  # (3,) along the rig's axes, posterior
+    # the same without errors that all images share, as those of a lens: what drives with these intrinsics scatter by
+    repeatability_rotation_deg: Floats  # (3,)
+    repeatability_translation_m: Floats  # (3,)
     sigma_focal_px: float
     # which of the six directions (rotation x y z, translation x y z) of this camera among the others the drive
     # observed, the rest is only the prior

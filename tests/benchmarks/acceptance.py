@@ -105,7 +105,7 @@ from tests.benchmarks.road_shapes import road_shapes
 from tests.benchmarks.seam_graphs import seam_graphs
 from tests.benchmarks.semantics import real_road, shadowed_road
 from tests.benchmarks.service import kills, maps_over_http, service
-from tests.benchmarks.sigmas import halves, simulated, without_positions
+from tests.benchmarks.sigmas import halves, simulated, with_wrong_lenses, without_positions
 from tests.benchmarks.simulated_routes import simulated_routes
 from tests.benchmarks.slow_tests import slow_tests_of_engine, slow_tests_of_service
 from tests.benchmarks.speed import from_descriptors, long_routes, speed, surround_speed
@@ -155,7 +155,7 @@ LINES = {
     "16": Line(repeated=(correspondence,)),
     "17": Line(timed=(kills,)),
     "18": Line(untimed=(wrong_manifests, faults)),
-    "19": Line(untimed=(halves, simulated, without_positions)),
+    "19": Line(untimed=(halves, simulated, without_positions, with_wrong_lenses)),
     "20": Line(timed=(kitti, speed_of_aggregation, maps_over_http), by_seed=(crossing, repeated, loop, vehicles)),
     "21": Line(untimed=(receivers,)),
     "22": Line(timed=(surround_peers,)),

@@ -308,3 +308,27 @@ def enlarged(simulated: SimulatedDrive, factor: int) -> SimulatedDrive:
         ),
         features=[replace(f, xy_px=(factor * f.xy_px).astype(np.float32)) for f in simulated.features],
     )
+
+
+def with_lens_errors(simulated: SimulatedDrive, off_px: float, *, seed: int = 0) -> SimulatedDrive:
+    """The manifest's lenses are off: each parameter of each lens moves what images show by `off_px`, RMS."""
+    rng = np.random.default_rng(seed)
+    drive = simulated.drive
+    cameras = [_with_lens_error(camera, off_px * rng.normal(size=8)) for camera in drive.cameras]
+    rig = drive.manifest.rig.model_copy(update={"cameras": cameras})
+    return replace(simulated, drive=Drive(drive.root, drive.manifest.model_copy(update={"rig": rig})))
+
+
+def _with_lens_error(camera: Camera, off_px: np.ndarray) -> Camera:
+    """A pinhole whose parameters are off by as much as moves pixels by `off_px` (8,), RMS over its image."""
+    fx, fy, cx, cy = camera.params
+    grid = np.meshgrid(np.linspace(0, camera.width, 20), np.linspace(0, camera.height, 12))
+    x, y = (grid[0].ravel() - cx) / fx, (grid[1].ravel() - cy) / fy
+    r2, zero, one = x**2 + y**2, np.zeros_like(x), np.ones_like(x)
+    moved = [
+        (x, zero), (zero, y), (one, zero), (zero, one),
+        (x * r2, y * r2), (x * r2**2, y * r2**2), (2 * x * y, r2 + 2 * y**2), (r2 + 2 * x**2, 2 * x * y),
+    ]  # fmt: skip
+    off = off_px / [np.sqrt(np.mean(a**2 + b**2)) for a, b in moved]
+    params = [fx + off[0], fy + off[1], cx + off[2], cy + off[3], *(off[4:] / fx)]
+    return camera.model_copy(update={"model": "OPENCV", "params": [float(value) for value in params]})

@@ -177,8 +177,10 @@ def drive_along(
             CameraCalibration(
                 rig_from_cam=pose,
                 params=p,
-                sigma_rotation_deg=np.full(3, cameras_off_deg or 0.1),
-                sigma_translation_m=np.full(3, 0.01),
+                sigma_rotation_deg=np.full(3, 3.0 * (cameras_off_deg or 0.1)),  # with what drives of a vehicle share
+                sigma_translation_m=np.full(3, 0.03),
+                repeatability_rotation_deg=np.full(3, cameras_off_deg or 0.1),
+                repeatability_translation_m=np.full(3, 0.01),
                 sigma_focal_px=1.0,
                 observed=np.repeat([True, False], 3),
             )

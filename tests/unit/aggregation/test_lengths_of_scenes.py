@@ -132,7 +132,7 @@ def with_rig(source: SourceScene, name: str, found_m: np.ndarray, given_m: np.nd
         cameras.append(camera.model_copy(update={"rig_from_cam": pose}))
         document = calibration["cameras"][camera.name]
         document["given"]["rig_from_cam"]["translation_m"] = declared_m
-        document["sigma"] |= {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
+        document["repeatability"] = {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
     rig = source.manifest.rig.model_copy(update={"cameras": cameras})
     manifest = source.manifest.model_copy(update={"rig": rig, "vehicle": "van"})
     return replace(source, name=name, manifest=manifest, calibration=calibration)

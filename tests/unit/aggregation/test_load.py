@@ -56,6 +56,23 @@ def test_packing_changes_nothing(folder: Path) -> None:
     assert again.name == "two"
 
 
+def test_certainty_of_cameras_is_without_errors_that_drives_share(folder: Path) -> None:
+    calibration = json.loads((folder / "calibration.json").read_text()) | {"adjusted": True}
+    for camera in calibration["cameras"].values():
+        camera["sigma"] = {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
+        camera["repeatability"] = {"rotation_deg": [0.02] * 3, "translation_m": [0.005] * 3}
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    stated = read_scene(folder, "one").certainty_of_cameras
+    assert stated is not None
+    np.testing.assert_allclose(stated[0], [[*[np.radians(0.02)] * 3, *[0.005] * 3]] * len(stated[0]))
+    for camera in calibration["cameras"].values():
+        del camera["repeatability"]  # a scene of an earlier version
+    (folder / "calibration.json").write_text(json.dumps(calibration))
+    stated = read_scene(folder, "one").certainty_of_cameras
+    assert stated is not None
+    np.testing.assert_allclose(stated[0], [[*[np.radians(0.1)] * 3, *[0.01] * 3]] * len(stated[0]))
+
+
 def test_damage_is_said_by_name(folder: Path) -> None:
     data = (folder / "model" / "points3D.bin").read_bytes()
     (folder / "model" / "points3D.bin").write_bytes(data[:-9])
@@ -64,15 +81,15 @@ def test_damage_is_said_by_name(folder: Path) -> None:
     (folder / "model" / "points3D.bin").write_bytes(data)
     calibration = json.loads((folder / "calibration.json").read_text()) | {"adjusted": True}
     for camera in calibration["cameras"].values():
-        camera["sigma"] = {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
+        camera["repeatability"] = {"rotation_deg": [0.1] * 3, "translation_m": [0.01] * 3}
     for wrong in (float("nan"), 0.0, "x"):
         broken = json.loads(json.dumps(calibration))
-        next(iter(broken["cameras"].values()))["sigma"]["rotation_deg"][1] = wrong
+        next(iter(broken["cameras"].values()))["repeatability"]["rotation_deg"][1] = wrong
         (folder / "calibration.json").write_text(json.dumps(broken))
         with pytest.raises(InputError, match=r"scene one: .*calibration.json is damaged"):
             read_scene(folder, "one")
     unknown = json.loads(json.dumps(calibration))
-    next(iter(unknown["cameras"].values()))["sigma"] = {}
+    next(iter(unknown["cameras"].values()))["repeatability"] = {}
     (folder / "calibration.json").write_text(json.dumps(unknown))
     assert read_scene(folder, "one").certainty_of_cameras is None
     (folder / "calibration.json").write_text(json.dumps(calibration))

@@ -172,7 +172,7 @@ def test_scale_prior_asks_for_one_combination_of_rotations() -> None:
     cameras = len(case.truth.camera_rotation)
     prior = ScalePrior(
         rotation=case.truth.camera_rotation, scale_by_rotation=rng.normal(size=(cameras, 3)), log_scale=0.0, sigma=0.01,
-        sigma_scale=0.01, sigma_of_corrections=0.0,
+        sigma_scale=0.01, sigma_of_corrections=0.0, share=0.0,
     )  # fmt: skip
     h = check_gradient(prior, case, state)
     assert np.linalg.matrix_rank(h) == 1

@@ -10,10 +10,10 @@ from mrasfm_engine.bundle_adjustment.priors import ScalePrior
 from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_similarity
-from mrasfm_engine.geometry.camera_model import project_points
 from mrasfm_engine.mapping import adjustment_rounds, given_scale
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
-from mrasfm_engine.mapping.given_scale import LENS_SIGMA_PX, ROTATION_SIGMA_PX
+from mrasfm_engine.mapping.given_scale import ROTATION_SIGMA_PX
+from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import scale_findings
 from mrasfm_engine.mapping.receiver_fit import Placement
@@ -234,27 +234,6 @@ def test_a_scale_that_the_drive_hardly_observes_is_a_finding() -> None:
         mapper = with_true_poses(make_model(simulated), simulated, range(8))
         said[sigma_m] = [finding.code for finding in scale_findings(mapper, refine(mapper))]
     assert said == {0.001: [], 0.5: ["scale-uncertain"]}
-
-
-@pytest.mark.parametrize(
-    ("model", "more"), [("OPENCV", [-0.1, 0.02, 1e-3, -1e-3]), ("OPENCV_FISHEYE", [0.05, -0.01, 3e-3, -1e-3])]
-)
-def test_every_parameter_of_a_lens_moves_keypoints_by_as_much(model: str, more: list[float]) -> None:
-    simulated = make_simulated_drive(units=4, cameras=1, points=800)
-    (camera,) = simulated.drive.manifest.rig.cameras
-    given = camera.model_copy(update={"model": model, "params": [*camera.params, *more]})
-    mapper = make_model(with_cameras(simulated, [given]), config=EngineConfig(threads=1))
-    kind, params = int(mapper.camera_kind[0]), mapper.state.camera_params[0]
-    sigma = given_scale._lens_sigmas(mapper)[0]
-    seen = project_points(kind, params, mapper.keypoints.rays)
-    for place, step in enumerate(sigma):
-        moved = params.copy()
-        if place < 2:
-            moved[place:2] *= 1.0 + step
-        else:
-            moved[place] += step
-        off_px = np.linalg.norm(project_points(kind, moved, mapper.keypoints.rays) - seen, axis=1)
-        assert np.sqrt((off_px**2).mean()) == pytest.approx(LENS_SIGMA_PX, rel=0.3), place
 
 
 def test_a_scale_of_which_no_sigma_is_known_is_said_to_be_uncertain() -> None:
