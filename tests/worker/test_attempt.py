@@ -16,7 +16,7 @@ from mrasfm_engine.io.axes import flu_from_body
 from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE, ModelFolder
 from mrasfm_engine.scene.drive import matrix_from_pose, pose_from_matrix
 from schemas import BodyAxes, Pose
-from schemas.artifacts import CHECKPOINT_FOLDER
+from schemas.artifacts import CHECKPOINT_FOLDER, checkpoint_file
 from schemas.manifest_check import check_manifest
 from schemas.parsing import parse_manifest
 from service.domain.jobs import ProgressNote
@@ -255,10 +255,8 @@ def test_timeout(small_drive: Path, scratch: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_full_disk(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    """Writing into the scene's folder fails, as the engine says; later it may not."""
-    out = AttemptFolder(scratch).out
-    out.mkdir()
-    (out / CHECKPOINT_FOLDER).write_text("a file where the folder belongs", encoding="utf-8")
+    """A finished stage cannot be written, as the engine says; later it may be."""
+    (AttemptFolder(scratch).out / CHECKPOINT_FOLDER / checkpoint_file("features") / "in its place").mkdir(parents=True)
     outcome = attempt(small_drive, scratch, settings)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable, outcome.stage) == ("storage", True, "features")
