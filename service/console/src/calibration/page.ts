@@ -35,7 +35,7 @@ export function Cameras({ document }: { document: Calibration }): Shown {
       : html`<p><span class="badge good">no single camera contradicts its calibration</span></p>`}
     <${Corrections} document=${document} what="rotation" unit="deg" title="Correction of the rotation about the rig's axes" />
     <${Corrections} document=${document} what="translation" unit="m" title="Correction of the position along the rig's axes" />
-    <p class="muted small">± is one sigma. Observed: the drive's images and positions determine this direction. Only the prior: they do not, and the value is the given one within its uncertainty.</p>
+    <p class="muted small">± is one sigma, with what the lenses may be off by. Observed: the drive's images and positions determine this direction. Only the prior: they do not, and the value is the given one within its uncertainty.</p>
     <${TimeOffsets} document=${document} />
     <${Intrinsics} document=${document} />`;
 }
@@ -137,7 +137,9 @@ function seriesOf(samples: readonly Sample[], index: number): Series[] {
     points: samples.flatMap((sample) => {
       const camera = sample.calibration.cameras[name];
       if (!camera) return [];
-      return [{ x: Date.parse(sample.at), y: camera.difference.rotation_vector_deg[index]!, sigma: camera.sigma?.rotation_deg?.[index] ?? 0 }];
+      // What the drives of a vehicle share, as errors of its lenses, says nothing of how they differ.
+      const scatter = camera.repeatability ?? camera.sigma;
+      return [{ x: Date.parse(sample.at), y: camera.difference.rotation_vector_deg[index]!, sigma: scatter?.rotation_deg?.[index] ?? 0 }];
     }),
   }));
 }
