@@ -118,7 +118,7 @@ class SourceScene:
         refined, or how certain it is is not known.
         """
         found = [self.calibration["cameras"][camera.name] for camera in self.drive.cameras]
-        stated = [camera.get("repeatability", camera["sigma"]) for camera in found]  # older scenes have sigmas alone
+        stated = [camera.get("repeatability") or camera["sigma"] for camera in found]  # some scenes have sigmas alone
         known_of_all = all({"rotation_deg", "translation_m"} <= sigmas.keys() for sigmas in stated)
         if self.calibration.get("adjusted") is not True or not known_of_all:
             return None

@@ -22,7 +22,7 @@ def calibration_document(scene: Scene, component: int = 0) -> dict[str, Any]:
     `refined` = `exp(rotation_vector)` times the given rotation, and the given translation plus `translation_m`.
     A direction that is not `observed` holds the prior: its refined value is no finding. Unknown sigmas are absent.
     `repeatability` is the sigma without errors that all images share, as those of lenses: other drives with the same
-    intrinsics err by the same.
+    intrinsics err by the same. Cameras that were held have none, and those whose intrinsics might vary.
     Where time offsets varied, `refined` has `time_offset_us`: images were taken so much later than their timestamps
     say, each camera's against the mean of all unless positions tell that too. Where intrinsics were asked for,
     `observed` and `verdict` have `focal`: of a focal length that the drive does not observe the given value is held.

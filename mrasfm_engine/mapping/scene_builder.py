@@ -128,7 +128,8 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
                 for c, p in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
             ]
             focal = refinement.certainty.sigma_camera[:, 6] * np.array(focal_px)
-    scatter = sigma
+    # What was given scatters by nothing, and priors of lenses are no scatter.
+    scatter = np.where(refinement.recalibrated[:, None] & (not asked), sigma, np.nan)
     if refinement.systematic is not None:
         sigma = np.where(refinement.recalibrated[:, None], refinement.systematic.sigma_camera(sigma), sigma)
     if refinement.directions is not None:

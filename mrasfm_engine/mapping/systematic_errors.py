@@ -13,6 +13,9 @@ that they tell well show s. Whatever is probable by that, weighed by how probabl
 moments, which cameras follow as an adjustment lets them [a consider covariance: Bierman, Factorization Methods for
 Discrete Sequential Estimation, 1977]. Errors that n stands for move cameras as independent ones do, n times as far;
 errors that units and points share are among them.
+
+Rotations take nearly all that a principal point is off by, so that little of it shows; it may be off by more than the
+rest of a lens, which is as improbable as it is more unless images show it.
 """
 
 from __future__ import annotations
@@ -32,12 +35,17 @@ from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX, lens_sigmas
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
 
+PRINCIPAL_POINT = (2, 3)  # places among the intrinsics
 STEPS_ACROSS = 24  # of the grid of pixels over an image
 SEEN = 1e-9  # information below this share of the largest is rounding
 # Sizes that are as probable as one another before images say anything: of lens errors in units of the usual one, and
 # the factor on independent errors. Beyond, no drive sees lens errors, or images no longer match.
-LENS_SIZES = np.geomspace(3e-5, 3.0, 81)
-FACTORS = np.geomspace(1.0, 100.0, 41)
+LENS_SIZES = np.geomspace(3e-5, 3.0, 51)
+FACTORS = np.geomspace(1.0, 100.0, 21)
+# Sizes of errors of principal points, in those of other parameters' errors, and how probable each is before images say
+# anything.
+RATIOS = 4.0 ** np.arange(5)
+PRIOR_OF_RATIOS = RATIOS**-1.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +57,7 @@ class SystematicErrors:
 
     by_lenses: Floats
     by_others: Floats  # with what priors err by
-    lens_px: float  # RMS over an image of what each parameter of a lens model is off by, as images show
+    lens_px: float  # RMS over an image of what each parameter but the principal point is off by, as images show
     factor: float  # of other errors on independent ones
 
     def sigma_camera(self, sigma: Floats) -> Floats:
@@ -97,7 +105,7 @@ def systematic_errors(
     )
     problem = problem.with_curvature()
     lenses, noise2 = _Lenses.reduce(problem, usual), _noise2(problem)
-    told = None if lenses is None else _told_by(lenses.information, lenses.derivatives, noise2)
+    told = None if lenses is None else _told_by(lenses, noise2)
     if lenses is None or told is None:
         return None
     by_lenses = lenses.moved @ told.moments @ lenses.moved.T
@@ -137,16 +145,18 @@ def _noise2(problem: Problem) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class _Lenses:
-    """Normal equations that are reduced to errors of lens models, in a axes in which their information is diagonal.
+    """Normal equations that are reduced to l parameters of lenses that are held, in units of their usual errors.
 
     Attributes
     ----------
     information, derivatives
-        (a,) of the cost without a prior of the lenses, for errors in units of the usual ones.
+        (l, l) and (l,) of the cost, without a prior of these.
+    is_principal_point
+        (l,)
     place
         (f,) of the cameras' other unknowns among all of theirs.
     moved
-        (f, a) by how much these follow errors of the lenses.
+        (f, l) by how much these follow errors of the lenses.
     of_images, of_terms
         (f, f) shares of independent errors of images, and of those of terms, in the covariance of these, lenses being
         right.
@@ -154,6 +164,7 @@ class _Lenses:
 
     information: Floats
     derivatives: Floats
+    is_principal_point: Bools
     place: Ints
     moved: Floats
     of_images: Floats
@@ -177,24 +188,24 @@ class _Lenses:
         known = factor @ factor.T
         gradient = -eliminated.coupled.T @ system.gradient[:split]
         gradient[: len(free)] += system.gradient[split + free]  # terms' own unknowns are where they cost least
+        camera, parameter = free // dof, np.searchsorted(PLACES_OF_INTRINSICS, free % dof)
         is_lens = np.isin(free % dof, PLACES_OF_INTRINSICS)
         lens, rest = np.flatnonzero(is_lens), np.setdiff1d(np.arange(len(known)), np.flatnonzero(is_lens))
         between, inverse = known[np.ix_(rest, lens)], np.linalg.inv(known[np.ix_(rest, rest)])
         follow = -inverse @ between
-        unit = usual[free[lens] // dof, np.searchsorted(PLACES_OF_INTRINSICS, free[lens] % dof)]
+        unit = usual[camera[lens], parameter[lens]]
         reduced = unit[:, None] * (known[np.ix_(lens, lens)] + between.T @ follow) * unit
-        information, axes = np.linalg.eigh(reduced - np.eye(len(lens)))
-        axes = unit[:, None] * axes
         place = free[~is_lens]
         f = len(place)
         columns = np.zeros((problem.layout.size, f))
         columns[:split], columns[split + place] = -eliminated.coupled[:, rest] @ inverse[:, :f], inverse[:f, :f]
         of_terms = information_of_terms(problem, problem.state, columns)
         return _Lenses(
-            information=information,
-            derivatives=axes.T @ (gradient[lens] + follow.T @ gradient[rest]),
+            information=reduced - np.eye(len(lens)),
+            derivatives=unit * (gradient[lens] + follow.T @ gradient[rest]),
+            is_principal_point=np.isin(parameter[lens], PRINCIPAL_POINT),
             place=place,
-            moved=follow[:f] @ axes,
+            moved=follow[:f] * unit,
             of_images=inverse[:f, :f] - of_terms,
             of_terms=of_terms,
         )
@@ -205,46 +216,58 @@ def _held_back(covariance: Floats, functional: Floats, share: float) -> Floats:
 
     The others follow that by their regression on it.
     """
-    along = covariance @ functional
+    along, response = covariance @ functional, np.eye(len(functional))
     variance = float(functional @ along)
-    result: Floats = np.eye(len(functional)) - share / max(variance, 1e-300) * np.outer(along, functional)
-    return result
+    if variance > 0.0:
+        response -= share / variance * np.outer(along, functional)
+    return response
 
 
 @dataclass(frozen=True, kw_only=True)
 class _Told:
     """Expectations by what the lenses' parameters show."""
 
-    moments: Floats  # (a, a) second moments of lens errors
-    size2: float  # squared size of lens errors, in units of the usual one
+    moments: Floats  # (l, l) second moments of lens errors
+    size2: float  # squared size of lens errors but for principal points, in units of the usual ones
     factor2: float  # squared factor of other errors on independent ones: its median, as it cannot be below one
 
 
-def _told_by(information: Floats, derivatives: Floats, noise2: float) -> _Told | None:
-    """Expectations by derivatives (a,), see the module; None where images see nothing of lens errors.
+def _told_by(lenses: _Lenses, noise2: float) -> _Told | None:
+    """Expectations by derivatives along lens parameters, see the module; None where images see nothing of lens errors.
 
     Parameters
     ----------
     noise2
         m of the module.
     """
-    seen = information > SEEN * max(float(information.max(initial=0.0)), 1.0)
-    if not seen.any():
+    if not len(lenses.information):
         return None
-    size2, factor2 = LENS_SIZES[:, None, None] ** 2, FACTORS[None, :, None] ** 2
-    known, found, others2 = information[seen], derivatives[seen], noise2 * factor2
-    spread = others2 + size2 * known
-    likely = -0.5 * (np.log(spread) + found**2 / (known * spread)).sum(axis=2)
-    weight = np.exp(likely - likely.max())
+    size2, others2 = LENS_SIZES[:, None, None] ** 2, noise2 * FACTORS[None, :, None] ** 2
+    likely, found = [], []
+    for ratio, prior in zip(RATIOS, PRIOR_OF_RATIOS, strict=True):
+        scale = np.where(lenses.is_principal_point, ratio, 1.0)
+        information, axes = np.linalg.eigh(scale[:, None] * lenses.information * scale)
+        axes = scale[:, None] * axes
+        derivatives = axes.T @ lenses.derivatives
+        seen = information > SEEN * max(float(information[-1]), 1.0)
+        if not seen.any():
+            return None
+        known, shown = np.where(seen, information, 0.0), np.where(seen, derivatives, 0.0)
+        spread = others2 + size2 * known
+        squared = shown**2 / (np.where(seen, known, 1.0) * spread)
+        likely.append(np.log(prior) - 0.5 * (np.log(spread / others2) + squared + seen * np.log(others2)).sum(axis=2))
+        found.append((axes, -size2 * shown / spread, size2 * others2 / spread))
+    weight = np.exp(np.array(likely) - np.max(likely))
     weight /= weight.sum()
-    error = -size2 * np.where(seen, derivatives, 0.0) / (others2 + size2 * np.where(seen, information, 0.0))
-    left = size2 * others2 / (others2 + size2 * np.where(seen, information, 0.0))
-    flat = error.reshape(-1, error.shape[2])
-    moments = flat.T @ (weight.reshape(-1, 1) * flat) + np.diag((weight[..., None] * left).sum(axis=(0, 1)))
+    moments = np.zeros_like(lenses.information)
+    for own, (axes, error, left) in zip(weight, found, strict=True):
+        flat, by_axis = error.reshape(-1, error.shape[2]), (own[..., None] * left).sum(axis=(0, 1))
+        moments += axes @ (flat.T @ (own.reshape(-1, 1) * flat) + np.diag(by_axis)) @ axes.T
+    of_size, of_factor = weight.sum(axis=(0, 2)), weight.sum(axis=(0, 1))
     return _Told(
         moments=moments,
-        size2=float((weight * size2[..., 0]).sum()),
-        factor2=float(np.exp((weight * np.log(factor2[..., 0])).sum())),
+        size2=float((of_size * LENS_SIZES**2).sum()),
+        factor2=float(np.exp((of_factor * np.log(FACTORS**2)).sum())),
     )
 
 

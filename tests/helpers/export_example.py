@@ -81,7 +81,7 @@ def make_scene(
             params=np.array(camera.params) + np.array([2.0, 2.0] + [0.0] * (len(camera.params) - 2)),
             sigma_rotation_deg=np.array([0.1, 0.2, 0.3]),
             sigma_translation_m=np.full(3, np.nan),
-            repeatability_rotation_deg=np.full(3, np.nan),
+            repeatability_rotation_deg=np.array([0.01, 0.02, 0.03]),
             repeatability_translation_m=np.full(3, np.nan),
             sigma_focal_px=1.5,
             observed=np.array([True, True, True, False, True, False]),

@@ -310,11 +310,19 @@ def enlarged(simulated: SimulatedDrive, factor: int) -> SimulatedDrive:
     )
 
 
-def with_lens_errors(simulated: SimulatedDrive, off_px: float, *, seed: int = 0) -> SimulatedDrive:
-    """The manifest's lenses are off: each parameter of each lens moves what images show by `off_px`, RMS."""
+def with_lens_errors(
+    simulated: SimulatedDrive, off_px: float, *, seed: int = 0, parameters: Sequence[int] = range(8)
+) -> SimulatedDrive:
+    """The manifest's lenses are off: each parameter of each lens moves what images show by `off_px`, RMS.
+
+    Parameters
+    ----------
+    parameters
+        Places among fx, fy, cx, cy, k1, k2, p1, p2; the others are right.
+    """
     rng = np.random.default_rng(seed)
-    drive = simulated.drive
-    cameras = [_with_lens_error(camera, off_px * rng.normal(size=8)) for camera in drive.cameras]
+    drive, is_off = simulated.drive, np.isin(np.arange(8), parameters)
+    cameras = [_with_lens_error(camera, off_px * rng.normal(size=8) * is_off) for camera in drive.cameras]
     rig = drive.manifest.rig.model_copy(update={"cameras": cameras})
     return replace(simulated, drive=Drive(drive.root, drive.manifest.model_copy(update={"rig": rig})))
 

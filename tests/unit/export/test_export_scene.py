@@ -290,6 +290,7 @@ def test_calibration(scene: Scene, written: Path) -> None:
     np.testing.assert_allclose(left["difference"]["translation_m"], [0.01, -0.02, 0.03], atol=1e-12)
     assert left["difference"]["focal_px"] == pytest.approx(2.0)
     assert left["sigma"] == {"rotation_deg": [0.1, 0.2, 0.3], "focal_px": 1.5}
+    assert left["repeatability"] == {"rotation_deg": [0.01, 0.02, 0.03]}
     assert left["observed"] == {"rotation": [True] * 3, "translation": [False, True, False]}
     assert left["verdict"]["translation"] == ["only the prior", "observed", "only the prior"]
     assert left["wrong"] is False

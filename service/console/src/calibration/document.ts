@@ -12,7 +12,7 @@ export interface CameraCalibration {
   refined: { rig_from_cam: Pose; params: number[]; time_offset_us?: number };
   difference: { rotation_vector_deg: number[]; rotation_deg: number; translation_m: number[]; focal_px: number };
   sigma?: { rotation_deg?: (number | null)[]; translation_m?: (number | null)[]; time_offset_us?: number };
-  repeatability?: { rotation_deg?: (number | null)[]; translation_m?: (number | null)[] }; // older scenes have none
+  repeatability?: { rotation_deg?: (number | null)[]; translation_m?: (number | null)[] }; // of cameras that varied, with lenses held
   observed?: { rotation: boolean[]; translation: boolean[] };
   verdict?: { rotation: string[]; translation: string[]; time_offset?: string };
   wrong: boolean;

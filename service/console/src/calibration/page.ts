@@ -138,8 +138,8 @@ function seriesOf(samples: readonly Sample[], index: number): Series[] {
       const camera = sample.calibration.cameras[name];
       if (!camera) return [];
       // What the drives of a vehicle share, as errors of its lenses, says nothing of how they differ.
-      const scatter = camera.repeatability ?? camera.sigma;
-      return [{ x: Date.parse(sample.at), y: camera.difference.rotation_vector_deg[index]!, sigma: scatter?.rotation_deg?.[index] ?? 0 }];
+      const scatter = camera.repeatability?.rotation_deg ?? camera.sigma?.rotation_deg;
+      return [{ x: Date.parse(sample.at), y: camera.difference.rotation_vector_deg[index]!, sigma: scatter?.[index] ?? 0 }];
     }),
   }));
 }
