@@ -37,6 +37,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 
 PRINCIPAL_POINT = (2, 3)  # places among the intrinsics
 STEPS_ACROSS = 24  # of the grid of pixels over an image
+NO_NOISE = 1e-12
 SEEN = 1e-9  # information below this share of the largest is rounding
 # Sizes that are as probable as one another before images say anything: of lens errors in units of the usual one, and
 # the factor on independent errors. Beyond, no drive sees lens errors, or images no longer match.
@@ -140,7 +141,7 @@ def _noise2(problem: Problem) -> float:
     options = problem.options
     squared = problem.errors_px2(problem.state) / options.sigma_px**2
     weight2 = (1.0 + squared / options.loss_scale**2) ** -2.0
-    return float((weight2 * squared).sum() / (2.0 * weight2.sum()))
+    return max(float((weight2 * squared).sum() / (2.0 * weight2.sum())), NO_NOISE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +230,7 @@ class _Told:
 
     moments: Floats  # (l, l) second moments of lens errors
     size2: float  # squared size of lens errors but for principal points, in units of the usual ones
-    factor2: float  # squared factor of other errors on independent ones: its median, as it cannot be below one
+    factor2: float  # squared factor of other errors on independent ones, geometric mean: it cannot be below one
 
 
 def _told_by(lenses: _Lenses, noise2: float) -> _Told | None:
