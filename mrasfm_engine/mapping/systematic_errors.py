@@ -42,7 +42,7 @@ SEEN = 1e-9  # information below this share of the largest is rounding
 # Sizes that are as probable as one another before images say anything: of lens errors in units of the usual one, and
 # the factor on independent errors. Beyond, no drive sees lens errors, or images no longer match.
 LENS_SIZES = np.geomspace(3e-5, 3.0, 51)
-FACTORS = np.geomspace(1.0, 100.0, 21)
+FACTORS = np.geomspace(1.0, 1000.0, 31)
 # Sizes of errors of principal points, in those of other parameters' errors, and how probable each is before images say
 # anything.
 RATIOS = 4.0 ** np.arange(5)
