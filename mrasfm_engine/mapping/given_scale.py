@@ -25,9 +25,10 @@ from scipy.special import expit, gammaln
 
 from mrasfm_engine.bundle_adjustment.marginal_covariances import scale_functional
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, ScalePrior, Term
-from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS
+from mrasfm_engine.bundle_adjustment.problem import PLACES_OF_INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.geometry import se3
+from mrasfm_engine.mapping.intrinsics import problem_of_all_intrinsics
 from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX, lens_sigmas
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats
@@ -57,12 +58,12 @@ def scale_of_given_rotations(
     cameras = len(mapper.camera_kind)
     lens = _over_keypoints(mapper)
     nuisance = IntrinsicsPrior(params=mapper.state.camera_params, sigma=lens)
-    problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(cameras, dtype=np.bool_),
-        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+    problem = problem_of_all_intrinsics(
+        mapper,
+        nuisance,
+        free_units=free_units,
         free_times=free_times,
-        terms=[*terms, nuisance],
+        terms=terms,
         options=options,
     )
     system = problem.normal_equations(problem.state, 0.0)

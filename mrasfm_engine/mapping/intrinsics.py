@@ -18,7 +18,7 @@ from mrasfm_engine.bundle_adjustment.observability_analysis import OBSERVED_RATI
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
-from mrasfm_engine.bundle_adjustment.solver import SolverOptions
+from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Cancel, Floats
@@ -123,15 +123,8 @@ def assess_intrinsics(
     free_units, terms, options, cancel
         Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
     """
-    cameras = len(mapper.camera_kind)
     prior = intrinsics_prior(mapper)
-    problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(cameras, dtype=np.bool_),
-        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
-        terms=[prior, *terms],
-        options=options,
-    )
+    problem = problem_of_all_intrinsics(mapper, prior, free_units=free_units, terms=terms, options=options)
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return held_intrinsics(mapper)
     # At the solution: residuals of a focal length that is off would pass for errors that its observations share.
@@ -142,6 +135,34 @@ def assess_intrinsics(
     return IntrinsicsDecision(
         free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]
     )
+
+
+def problem_of_all_intrinsics(
+    mapper: Mapper,
+    prior: IntrinsicsPrior,
+    *,
+    free_units: Bools,
+    free_times: Bools | None = None,
+    terms: Sequence[Term],
+    options: SolverOptions,
+) -> Problem:
+    """The adjustment in which all cameras vary with all their intrinsics, also those that models do not have.
+
+    Parameters
+    ----------
+    prior
+        Of the intrinsics, beside the other `terms`.
+    """
+    cameras = len(mapper.camera_kind)
+    problem, _ = mapper.problem(
+        free_units,
+        free_cameras=np.ones(cameras, dtype=np.bool_),
+        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+        free_times=free_times,
+        terms=[*terms, prior],
+        options=options,
+    )
+    return problem
 
 
 def intrinsics_prior(mapper: Mapper) -> IntrinsicsPrior:

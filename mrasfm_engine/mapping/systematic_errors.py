@@ -31,6 +31,7 @@ from mrasfm_engine.bundle_adjustment.shared_errors import information_of_terms
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry.camera_model import unproject_pixels
 from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.intrinsics import problem_of_all_intrinsics
 from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX, lens_sigmas
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Bools, Floats, Ints
@@ -96,15 +97,14 @@ def systematic_errors(
     """
     cameras = len(mapper.camera_kind)
     usual = _over_images(mapper)
-    problem, _ = mapper.problem(
-        free_units,
-        free_cameras=np.ones(cameras, dtype=np.bool_),
-        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+    problem = problem_of_all_intrinsics(
+        mapper,
+        IntrinsicsPrior(params=mapper.state.camera_params, sigma=usual),
+        free_units=free_units,
         free_times=free_times,
-        terms=[*terms, IntrinsicsPrior(params=mapper.state.camera_params, sigma=usual)],
+        terms=terms,
         options=options,
-    )
-    problem = problem.with_curvature()
+    ).with_curvature()
     lenses, noise2 = _Lenses.reduce(problem, usual), _noise2(problem)
     told = None if lenses is None else _told_by(lenses, noise2)
     if lenses is None or told is None:

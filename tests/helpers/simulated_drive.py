@@ -321,10 +321,9 @@ def with_lens_errors(
         Places among fx, fy, cx, cy, k1, k2, p1, p2; the others are right.
     """
     rng = np.random.default_rng(seed)
-    drive, is_off = simulated.drive, np.isin(np.arange(8), parameters)
-    cameras = [_with_lens_error(camera, off_px * rng.normal(size=8) * is_off) for camera in drive.cameras]
-    rig = drive.manifest.rig.model_copy(update={"cameras": cameras})
-    return replace(simulated, drive=Drive(drive.root, drive.manifest.model_copy(update={"rig": rig})))
+    is_off = np.isin(np.arange(8), parameters)
+    cameras = simulated.drive.cameras
+    return with_cameras(simulated, [_with_lens_error(c, off_px * rng.normal(size=8) * is_off) for c in cameras])
 
 
 def _with_lens_error(camera: Camera, off_px: np.ndarray) -> Camera:
