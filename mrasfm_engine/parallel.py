@@ -9,7 +9,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from typing import TypeVar
 
@@ -35,11 +35,11 @@ def in_ranges(threads: int, count: int, work: Callable[[int, int], None]) -> Non
         return
     ranges = iter(list(pairwise(even_bounds(count, threads * RANGES).tolist())))  # a list's iterator is thread-safe
 
-    def run(_: int) -> None:
+    def run() -> None:
         for lo, hi in ranges:
             work(lo, hi)
 
-    list(_pool(threads).map(run, range(threads)))
+    _together([run] * threads)
 
 
 def even_bounds(count: int, parts: int) -> Ints:
@@ -54,7 +54,7 @@ def in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:
     if parts == 1:
         work(int(bounds[0]), int(bounds[1]), 0)
         return
-    list(_pool(parts).map(work, bounds[:-1], bounds[1:], range(parts)))
+    _together([partial(work, lo, hi, part) for part, (lo, hi) in enumerate(pairwise(bounds.tolist()))])
 
 
 def mapped(threads: int, work: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
@@ -82,6 +82,19 @@ def in_order(threads: int, work: Callable[[Item], Result], items: Iterable[Item]
                 yield waiting.popleft().result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _together(tasks: Sequence[Callable[[], None]]) -> None:
+    """Run tasks at the same time, the last in the caller's thread: it need not wait for others to wake up."""
+    *others, own = tasks
+    futures = [_pool(len(others)).submit(task) for task in others]
+    try:
+        own()
+    finally:
+        for future in futures:
+            future.exception()
+    for future in futures:
+        future.result()
 
 
 @cache

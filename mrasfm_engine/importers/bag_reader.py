@@ -7,7 +7,7 @@ commands that read none start without it.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -180,10 +180,11 @@ def _typestore(connections: Sequence[Connection]) -> Typestore:
     """
     from rosbags.interfaces import MessageDefinitionFormat
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+    from rosbags.typesys.stores import ros2_humble
 
     types: dict[str, Any] = {}
     if any(c.msgdef.format is MessageDefinitionFormat.NONE for c in connections):
-        types.update(get_typestore(Stores.ROS2_HUMBLE).fielddefs)
+        types.update(ros2_humble.FIELDDEFS)
     for connection in connections:
         definition = connection.msgdef
         if definition.format is MessageDefinitionFormat.MSG:
@@ -192,9 +193,21 @@ def _typestore(connections: Sequence[Connection]) -> Typestore:
             for part in definition.data.split("=" * 80 + "\n"):
                 text = part.partition("\n")[2] if part.startswith("IDL: ") else part
                 types.update(get_types_from_idl(text) if text.strip() else {})
+    _require_fields(types, ros2_humble.FIELDDEFS)
     store = get_typestore(Stores.EMPTY)
     store.register(types)
     return store
+
+
+def _require_fields(types: Mapping[str, Any], standard: Mapping[str, Any]) -> None:
+    """Refuse definitions that lack fields of the standard ones: messages would parse as something else, or by chance.
+
+    ROS 1 has some names in capitals. Fields beyond the standard ones do no harm.
+    """
+    for name in types.keys() & standard.keys():
+        missing = {field.lower() for field, _ in standard[name][1]} - {field.lower() for field, _ in types[name][1]}
+        if missing:
+            raise ValueError(f"its definition of {name} has no field {', '.join(sorted(missing))}")
 
 
 @contextmanager

@@ -164,7 +164,7 @@ def fit(
         scratch.information, scratch.gradient, scratch.factor, scratch.step, scratch.best
     )  # fmt: skip
     p[2] = min(max(p[2], least), most)
-    lowest, lowest_data = np.inf, np.inf
+    lowest, lowest_data, is_done = np.inf, np.inf, False
     for i in range(len(p)):
         best[i] = p[i]
     for iteration in range(0 if is_near else -ROUGH_ITERATIONS, ITERATIONS + 1):
@@ -175,7 +175,7 @@ def fit(
             a[i, i] += weight[i]
             b[i] += weight[i] * (p[i] - mean[i])
         if iteration >= 0 and total < lowest:
-            is_done = lowest - total < SMALL_GAIN
+            is_done = lowest - total < SMALL_GAIN or iteration == ITERATIONS
             lowest, lowest_data = total, data
             for i in range(unknowns):
                 best[i] = p[i]
@@ -201,9 +201,10 @@ def fit(
         for i in range(unknowns):
             p[i] -= step[i]
         p[2] = min(max(p[2], least), most)
-    for i in range(unknowns):
-        p[i] = best[i]
-    _linearise(count, unknowns, p, sight, views, LOSS_SIGMAS, scratch)
-    for i in range(2, unknowns):
-        a[i, i] += weight[i]
+    if not is_done:  # the information is not that at the best p
+        for i in range(unknowns):
+            p[i] = best[i]
+        _linearise(count, unknowns, p, sight, views, LOSS_SIGMAS, scratch)
+        for i in range(2, unknowns):
+            a[i, i] += weight[i]
     return lowest, lowest_data, factorise(a, unknowns, factor) and lowest < np.inf

@@ -821,6 +821,18 @@ def test_damaged_bags_are_refused_by_name(tmp_path: Path, kind: str) -> None:
     assert 15 < refusals <= 40
 
 
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_definition_without_a_field_of_the_standard_is_refused(tmp_path: Path, kind: str) -> None:
+    path = stereo(is_ros1=kind == "ros1").write(tmp_path / ("bag.bag" if kind == "ros1" else "bag"), kind)
+    file = path if kind == "ros1" else path / ("bag.mcap" if kind == "mcap" else "bag.db3")
+    whole = file.read_bytes()
+    assert whole.count(b"distortion_model")
+    file.write_bytes(whole.replace(b"distortion_model", b"distortion_madel"))
+    with pytest.raises(InputError, match="definition of sensor_msgs/msg/CameraInfo has no field distortion_model"):
+        import_recording(path, tmp_path / "drive")
+    assert not (tmp_path / "drive").exists()
+
+
 def test_a_recording_of_another_kind_in_mcap_is_refused(tmp_path: Path) -> None:
     path = stereo().write(tmp_path / "bag", "mcap") / "bag.mcap"
     path.write_bytes(path.read_bytes().replace(b"ros2", b"ros1", 1))
