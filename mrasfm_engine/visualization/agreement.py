@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mrasfm_engine.geometry.parabola import vertex
-from mrasfm_engine.types import Floats, Floats32, Ints
+from mrasfm_engine.types import Bytes, Floats, Floats32, Ints
 from mrasfm_engine.visualization.mosaic import Grid, Mosaic
 from mrasfm_engine.visualization.views import GIVEN, REFINED
 
@@ -106,12 +106,12 @@ class _Block:
     window: Floats32  # (2, s + 2 margins, s + 2 margins)
 
 
-def _gray(mosaic: Mosaic) -> list[list[Floats32]]:
+def _gray(mosaic: Mosaic) -> list[list[Bytes]]:
     """Grey pictures by calibration and layer."""
     sigma = SMOOTHING_M / mosaic.grid.cell_m
     return [
         [
-            np.asarray(cv2.GaussianBlur(cv2.cvtColor(layer, cv2.COLOR_RGB2GRAY), None, sigma), dtype=np.float32)
+            np.asarray(cv2.GaussianBlur(cv2.cvtColor(layer, cv2.COLOR_RGB2GRAY), None, sigma), dtype=np.uint8)
             for layer in layers
         ]
         for layers in mosaic.color
@@ -140,19 +140,20 @@ def _textured_blocks(mosaic: Mosaic, trajectory: cKDTree, size: int, margin: int
     return [
         _Block(
             contrast=float(contrast[k]),
-            template=np.stack([g[0][r[k] : r[k] + size, c[k] : c[k] + size] for g in gray]),
+            template=np.stack([g[0][r[k] : r[k] + size, c[k] : c[k] + size] for g in gray], dtype=np.float32),
             window=np.stack(
-                [g[1][r[k] - margin : r[k] + size + margin, c[k] - margin : c[k] + size + margin] for g in gray]
+                [g[1][r[k] - margin : r[k] + size + margin, c[k] - margin : c[k] + size + margin] for g in gray],
+                dtype=np.float32,
             ),
         )
         for k in best
     ]
 
 
-def _contrast(gray: Floats32, r: Ints, c: Ints, size: int) -> Floats32:
+def _contrast(gray: Bytes, r: Ints, c: Ints, size: int) -> Floats32:
     """Standard deviation (n,) of the pieces of so many pixels a side that begin at rows and columns (n,)."""
     pieces = np.lib.stride_tricks.sliding_window_view(gray, (size, size))[r, c]
-    result: Floats32 = pieces.std(axis=(1, 2))
+    result: Floats32 = pieces.astype(np.float32).std(axis=(1, 2))
     return result
 
 

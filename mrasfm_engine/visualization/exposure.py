@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.jit import njit
+from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.scene import Scene, observed_colors
 from mrasfm_engine.types import Floats
 from mrasfm_engine.visualization.mosaic import Mosaic
 from mrasfm_engine.visualization.views import REFINED
 
 ROUNDS = 6
+COLOURS_AT_ONCE = 2
 SHRINKAGE = 20.0  # observations that the guess "as bright as all others" counts for
 MAX_GAIN = 4.0
 MAX_CAMERA_GAIN = 1.4
@@ -38,9 +40,15 @@ def exposure_gains(scene: Scene) -> Floats:
     images, start = np.unique(image[order], return_index=True)
     bounds = np.append(start, len(image))
     count = np.maximum(np.bincount(point), 1)
-    for k in range(3):  # colour by colour: of all at once, logarithms and their means take most of the memory
+    colours = 1 if (colors == colors[:, :1]).all() else 3
+
+    def gains_of(k: int) -> Floats:
         exposure = _exposures(LOG_COLOR[colors[:, k]], point, count, bounds)
-        gains[images, k] = np.clip(np.exp(-exposure), 1 / MAX_GAIN, MAX_GAIN)
+        result: Floats = np.clip(np.exp(-exposure), 1 / MAX_GAIN, MAX_GAIN)
+        return result
+
+    # Not all colours at once: logarithms and their means take most of the memory.
+    gains[images] = np.stack(list(mapped(COLOURS_AT_ONCE, gains_of, range(colours))), axis=1)
     return gains
 
 
