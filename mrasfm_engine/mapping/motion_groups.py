@@ -25,6 +25,7 @@ from mrasfm_engine.types import Floats, Ints
 
 NEIGHBOURS = 12
 REACH_M = 1.2  # to neighbours, at a track's distance: half of a car
+LENGTH_M = 5.0  # of cars, as sigma of how far two of their tracks are one behind the other
 MOST_EVIDENCE = 8.0  # that a track has for itself: more is a matter of wrong matches, not of motion
 PRIOR = 0.5  # log odds for standing, beside a track that may move
 BOND = 1.0  # log odds that a neighbour adds that moves,
@@ -66,7 +67,8 @@ def group(
     suspects
         Tracks (m,) that may move. They and their neighbours are judged, all others stand.
     known
-        Log odds (tracks,) to move by something else than a track's own observations; NaN where there are none.
+        Log odds (tracks,) to move by something else than a track's own observations, that is by what is around its
+        place; NaN where there are none.
     focal_px
         Of every camera (c,).
     weigh
@@ -89,8 +91,8 @@ def group(
     mixed = np.where(is_weighed, 0.5 * motion.observations[nodes] * (motion.misfit[nodes] - MIXED), -np.inf)
     score, reason = np.empty(len(nodes)), np.empty(len(nodes), dtype=np.int64)
     _mean_field(
-        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes], mixed,
-        score, reason,
+        linked, evidence, motion.log_prior[nodes], motion.velocity_m_s[nodes], motion.covariance[nodes],
+        motion.inverse_distance[nodes], is_known, mixed, score, reason,
     )  # fmt: skip
     order = np.argsort(nodes)
     # What was not weighed, with too few observations, is not known to move.
@@ -185,8 +187,17 @@ def _without_prior(velocity: Any, covariance: Any, information: Any, pulled: Any
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _are_beside(moving: Any, standing: Any) -> float:
+    """Likelihood that one track, if it moves, and another, if it stands, are on one thing: 1 at equal distances."""
+    length = LENGTH_M * moving[2] * moving[2]
+    variance = moving[3] + standing[1] + length * length
+    return math.exp(-0.5 * (moving[2] - standing[0]) ** 2 / variance)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _mean_field(
-    linked: Any, evidence: Any, prior: Any, velocity: Any, covariance: Any, mixed: Any, score: Any, reason: Any
+    linked: Any, evidence: Any, prior: Any, velocity: Any, covariance: Any, inverse_distance: Any, is_known: Any,
+    mixed: Any, score: Any, reason: Any,
 ) -> None:  # fmt: skip
     """Log odds and reasons of all nodes; `linked` (n, k) are their neighbours: -1 for one that stands, -2 for none."""
     count, size = linked.shape
@@ -207,7 +218,9 @@ def _mean_field(
                     continue
                 b = belief[m] if m >= 0 else -1.0
                 if b <= 0.0:
-                    for_standing -= BOND_TO_STANDING * b
+                    # What is known of a track is of its place, and what stands far behind that is seen around any car.
+                    beside = _are_beside(inverse_distance[n], inverse_distance[m]) if is_known[n] and m >= 0 else 1.0
+                    for_standing -= BOND_TO_STANDING * b * beside
                     continue
                 for_moving += BOND * b
                 moving += b

@@ -72,6 +72,8 @@ class TrackMotion:
     velocity_m_s: Floats  # (n, 2) along and across the own direction of motion
     covariance: Floats  # (n, 3) of the velocity: xx, xy, yy
     distance_m: Floats  # (n,) from the reference camera, if it moves
+    # (n, 4) inverse distance from there in 1 / m and its variance: if it stands, and if it moves
+    inverse_distance: Floats
     misfit: Floats  # (n,) mean cost of an observation if it stands
     observations: Ints  # (n,) that were looked at
     reference: Ints  # (n,) keypoint; -1 where there are too few observations
@@ -85,6 +87,7 @@ class TrackMotion:
             velocity_m_s=np.zeros((count, 2)),
             covariance=np.tile([SPEED_M_S**2, 0.0, SPEED_M_S**2], (count, 1)),
             distance_m=np.full(count, np.inf),
+            inverse_distance=np.tile([0.0, np.inf, 0.0, np.inf], (count, 1)),
             misfit=np.zeros(count),
             observations=np.zeros(count, dtype=np.int64),
             reference=np.full(count, -1, dtype=np.int64),
@@ -120,7 +123,7 @@ def weigh_tracks(
         lambda lo, hi: _weigh(
             which[lo:hi], tracks.first, tracks.keypoints, k.band, k.camera, k.xy_px, k.rays, points_m, triangulated,
             views, path, only_unsure, into.log_evidence, into.log_prior, into.velocity_m_s, into.covariance,
-            into.distance_m, into.misfit, into.observations, into.reference,
+            into.distance_m, into.inverse_distance, into.misfit, into.observations, into.reference,
         ),
     )  # fmt: skip
 
@@ -238,6 +241,14 @@ def _cross(a: Any, b: Any, out: Any) -> None:
 
 
 @uncounted()
+def _variance_of_inverse_distance(scratch: Any) -> float:
+    scratch.gradient[:] = 0.0
+    scratch.gradient[2] = 1.0
+    solve(scratch.factor, scratch.gradient, MOVES, scratch.step)
+    return float(scratch.step[2])
+
+
+@uncounted()
 def _velocity_covariance(factor: Any, p: Any, gradient: Any, column: Any, out: Any) -> None:
     """Covariance xx, xy, yy of the velocity nu / rho at p, that of rho included."""
     rho = p[2]
@@ -257,7 +268,7 @@ def _velocity_covariance(factor: Any, p: Any, gradient: Any, column: Any, out: A
 def _weigh(
     which: Any, first: Any, members: Any, band: Any, camera: Any, xy: Any, rays: Any, points: Any, triangulated: Any,
     views: Any, path: Any, only_unsure: bool, evidence: Any, prior: Any, velocity: Any, covariance: Any, distance: Any,
-    misfit: Any, observations: Any, reference: Any,
+    inverse_distance: Any, misfit: Any, observations: Any, reference: Any,
 ) -> None:  # fmt: skip
     most_seen = MAX_OBSERVATIONS
     sight = Sight(
@@ -267,7 +278,7 @@ def _weigh(
     )  # fmt: skip
     _weigh_each(
         which, first, members, band, camera, xy, rays, points, triangulated, views, path, only_unsure, evidence, prior,
-        velocity, covariance, distance, misfit, observations, reference,
+        velocity, covariance, distance, inverse_distance, misfit, observations, reference,
         sight, new_scratch(), np.zeros(5), np.zeros(5), np.zeros(5), np.zeros(5), np.empty(3),
     )  # fmt: skip
 
@@ -276,7 +287,7 @@ def _weigh(
 def _weigh_each(
     which: Any, first: Any, members: Any, band: Any, camera: Any, xy: Any, rays: Any, points: Any, triangulated: Any,
     views: Any, path: Any, only_unsure: bool, evidence: Any, prior: Any, velocity: Any, covariance: Any, distance: Any,
-    misfit: Any, observations: Any, reference: Any,
+    inverse_distance: Any, misfit: Any, observations: Any, reference: Any,
     sight: Any, scratch: Any, p: Any, start: Any, mean: Any, weight: Any, c: Any,
 ) -> None:  # fmt: skip
     nearest = 1.0 / NEAREST_M
@@ -320,6 +331,7 @@ def _weigh_each(
         if not is_sound:
             continue
         log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])
+        inverse_distance[t, 0], inverse_distance[t, 1] = p[2], _variance_of_inverse_distance(scratch)
         log_stands = -0.5 * (stands + log_determinant(scratch.factor, MOVES) - log_priors)
         lowest = max(least, 1.0 / FARTHEST_M, -fall / max(HIGHEST_M - path.camera_height_m, 0.5))
         expected = fall / max(path.camera_height_m - BODY_M, 0.3) if fall > HORIZON else 1.0 / FAR_M
@@ -344,4 +356,5 @@ def _weigh_each(
                 prior[t] = -TALL if path.camera_height_m - fall / p[2] > CAR_M else 0.0
                 velocity[t, 0], velocity[t, 1] = p[3] / p[2], p[4] / p[2]
                 distance[t] = 1.0 / p[2]
+                inverse_distance[t, 2], inverse_distance[t, 3] = p[2], _variance_of_inverse_distance(scratch)
                 _velocity_covariance(scratch.factor, p, scratch.gradient, scratch.step, covariance[t])

@@ -15,6 +15,7 @@ def grouped(
     known: np.ndarray | None = None,
     velocity_m_s: np.ndarray | None = None,
     sigma_m_s: np.ndarray | float = SPEED_M_S,
+    distance_m: np.ndarray | float = 10.0,
 ) -> MotionGroups:
     """Groups of nine tracks side by side in an image, a square of 40 px 10 m away at a focal length of 500 px.
 
@@ -33,6 +34,8 @@ def grouped(
         velocity_m_s=np.zeros((count, 2)) if velocity_m_s is None else velocity_m_s,
         covariance=np.broadcast_to(sigma_m_s, count)[:, None] ** 2 * np.array([1.0, 0.0, 1.0]),
         distance_m=np.full(count, 10.0),
+        inverse_distance=1.0 / np.broadcast_to(distance_m, count)[:, None] * [1.0, 0.0, 1.0, 0.0]
+        + [0.0, 1e-6, 0.0, 1e-6],
         misfit=np.zeros(count),
         observations=np.full(count, 2),
         reference=np.arange(count),
@@ -68,6 +71,12 @@ def test_one_neighbour_that_moves_is_not_enough() -> None:
     known[0] = 3.0
     found = grouped(np.full(9, HARDLY_TELLS), known)
     assert IN_THE_MIDDLE not in found.tracks
+
+
+@pytest.mark.parametrize(("behind_m", "moves"), [(0.0, False), (2.0, False), (30.0, True)])
+def test_what_stands_far_behind_says_nothing_of_a_track_that_is_known_to_move(behind_m: float, moves: bool) -> None:
+    found = grouped(around(-4.0, HARDLY_TELLS), known=around(np.nan, 3.0), distance_m=around(10.0 + behind_m, 10.0))
+    assert (IN_THE_MIDDLE in found.tracks) == moves
 
 
 def test_what_is_sure_to_stand_stays_among_those_that_move() -> None:
