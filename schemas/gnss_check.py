@@ -44,6 +44,7 @@ def check_gnss(manifest: DriveManifest, image_times_us: NDArray[np.int64]) -> li
         return findings  # the rest assumes an order
     return [
         *_check_land(gnss),
+        *_check_heights(gnss),
         *_check_cover(image_times_us, times),
         *_check_jumps(gnss, times),
         *_check_swapped(manifest, times),
@@ -86,6 +87,21 @@ def _check_land(gnss: Gnss) -> list[Finding]:
             "gnss-at-sea",
             f"{int(at_sea.sum())} of {len(degrees)} gnss.samples lie in the sea around latitude 0, longitude 0",
             "Give latitude_deg and longitude_deg in degrees, not in radians, and leave out samples without a fix.",
+        )
+    ]
+
+
+def _check_heights(gnss: Gnss) -> list[Finding]:
+    """Find heights that are all zero, which no receiver measures: what writes the samples fills them in."""
+    count = len(gnss.samples)
+    if count < 2 or any(sample.height_m != 0.0 for sample in gnss.samples):
+        return []
+    return [
+        warning(
+            "gnss-heights-zero",
+            f"all {count} gnss.samples have a height_m of exactly 0, as where heights are missing: the scene is made "
+            "level, at height 0, and its sigmas say that this is known",
+            "Give the receiver's heights. Where there are none, give a sigma_vertical_m of some hundreds of metres.",
         )
     ]
 

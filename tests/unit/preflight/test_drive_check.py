@@ -335,6 +335,16 @@ def test_positions_where_there_is_no_land(drive_document: Document, write_drive:
     assert finding.what.startswith(f"{len(wrong)} of {len(samples)} gnss.samples lie in the sea")
 
 
+def test_heights_that_are_all_zero(drive_document: Document, write_drive: WriteDrive) -> None:
+    samples = drive_document["gnss"]["samples"]
+    for sample in samples:
+        sample["height_m"] = 0.0
+    what = only(write_drive(drive_document), "gnss-heights-zero", Severity.WARNING).what
+    assert what.startswith(f"all {len(samples)} gnss.samples have a height_m of exactly 0")
+    samples[-1]["height_m"] = 0.1  # a coast is at such heights
+    assert findings(write_drive(drive_document)) == {}
+
+
 def test_rough_poses_in_time(drive_document: Document, write_drive: WriteDrive) -> None:
     drive_document["rough_poses"] = rough_poses([(0.0, float(i)) for i in range(5)])
     poses = drive_document["rough_poses"]["poses"]
