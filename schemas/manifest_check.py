@@ -215,7 +215,8 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
     """Cameras stand about upright on a vehicle; if none does, the rig's axes are not what was said.
 
     Unless they stand on edge, as portrait cameras do whose images are stored as they were read: all of them look about
-    level, and not only aside, which wrong axes and poses given as their inverse do not leave so.
+    level, and not only aside, which wrong axes and poses given as their inverse do not leave so. Or all of them look
+    down, as those of a vehicle that surveys the road: steep enough, and an image's upper edge points ahead or aside.
     """
     up = np.array(_UP_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
     forward = np.array(_FORWARD_IN_BODY[manifest.rig.body_axes], dtype=np.float64)
@@ -236,6 +237,8 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
     on_edge = np.abs(upright) < np.sin(np.radians(LEVEL_DEG))
     if not turned.all():
         return [warning("camera-turned", what, f"Nothing needs to be done where it is mounted so. {remedy}")]
+    if (axes[:, 1] @ up < -np.sin(np.radians(LEVEL_DEG))).all():
+        return [warning("rig-axes", what, f"Nothing needs to be done where they look down at the road. {remedy}")]
     if level.all() and ahead.any() and on_edge.all():
         return [warning("rig-axes", what, f"Nothing needs to be done where they stand on edge. {remedy}")]
     return [

@@ -429,6 +429,18 @@ def test_portrait_cameras_whose_images_lie_on_their_side_are_no_wrong_axes(
     only(write_drive(drive_document), "rig-axes", Severity.ERROR)
 
 
+def test_cameras_that_look_down_at_the_road_are_no_wrong_axes(
+    drive_document: Document, write_drive: WriteDrive
+) -> None:
+    ahead = Rotation.from_quat([-0.5, 0.5, -0.5, 0.5])  # in forward, left, up
+    cameras = drive_document["rig"]["cameras"]
+    for camera, pitch_deg in zip(cameras, (-90.0, -65.0), strict=True):
+        camera["rig_from_cam"]["rotation_xyzw"] = (ahead * Rotation.from_euler("x", pitch_deg, True)).as_quat().tolist()
+    assert "look down at the road" in only(write_drive(drive_document), "rig-axes", Severity.WARNING).remedy
+    cameras[0]["rig_from_cam"]["rotation_xyzw"] = (ahead * Rotation.from_euler("x", 90.0, True)).as_quat().tolist()
+    only(write_drive(drive_document), "rig-axes", Severity.ERROR)  # one looks up
+
+
 def test_findings_read_well(drive_document: Document, write_drive: WriteDrive) -> None:
     root = write_drive(drive_document)
     (root / "images/left/000002.png").unlink()
