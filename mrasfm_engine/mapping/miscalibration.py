@@ -10,13 +10,14 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.mapping.systematic_errors import SystematicErrors
 from mrasfm_engine.mapping.unit_registration import Registration
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats
 from schemas.findings import Finding, warning
 
 SIGNIFICANT_SIGMAS = 5.0  # of the posterior: less is no correction at all
-BEYOND_PRIOR_SIGMAS = 5.0  # of the prior: what was declared cannot be true
+BEYOND_PRIOR_SIGMAS = 5.0  # of the prior and of what all images share: what was declared cannot be true
 UNUSUAL = 5.0  # times the other cameras' median correction, where that is more than
 MIN_UNUSUAL_DEG, MIN_UNUSUAL_M = 1.0, 0.1  # what mountings and calibrations are off by as a rule
 MIN_OTHERS = 2  # cameras that say what is usual
@@ -42,12 +43,21 @@ class MiscalibratedPair:
     translation_m: float
 
 
-def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observability) -> MiscalibratedPair | None:
-    """Check whether the two cameras of a rig are off against each other by more than their prior can be."""
+def find_wrong_pair(
+    prior: CalibrationPrior, state: State, directions: Observability, systematic: SystematicErrors | None = None
+) -> MiscalibratedPair | None:
+    """Check whether the two cameras of a rig are off against each other by more than their prior can be.
+
+    Parameters
+    ----------
+    systematic
+        Errors of the corrections that all images share, if they are known.
+    """
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
         return None
     sigma, posterior = _sigmas(prior, directions)
+    sigma = _with_systematic(sigma, posterior, systematic)
     if not any(
         _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=np.inf)
         for c in range(2)
@@ -61,10 +71,17 @@ def find_wrong_pair(prior: CalibrationPrior, state: State, directions: Observabi
     )
 
 
-def find_miscalibrations(prior: CalibrationPrior, state: State, directions: Observability) -> list[Miscalibration]:
+def find_miscalibrations(
+    prior: CalibrationPrior, state: State, directions: Observability, systematic: SystematicErrors | None = None
+) -> list[Miscalibration]:
     """Cameras whose correction is certain, and far outside its prior or far from what the other cameras need.
 
     Only directions count that the drive observes.
+
+    Parameters
+    ----------
+    systematic
+        Errors of the corrections that all images share, if they are known.
     """
     corrections = prior.corrections(state)
     if len(corrections) == 2:
@@ -74,10 +91,11 @@ def find_miscalibrations(prior: CalibrationPrior, state: State, directions: Obse
         corrections = corrections - np.median(corrections, axis=0)
     corrections = np.where(directions.observed, corrections, 0.0)
     sigma, posterior = _sigmas(prior, directions)
+    allowed = _with_systematic(sigma, posterior, systematic)
     found = []
     for c in range(len(corrections)):
         verdicts = [
-            _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=floor)
+            _is_wrong(corrections[:, part], c, sigma=allowed[c, part], posterior=posterior[c, part], floor=floor)
             for part, floor in ((slice(0, 3), np.radians(MIN_UNUSUAL_DEG)), (slice(3, 6), MIN_UNUSUAL_M))
         ]
         if not any(verdicts):
@@ -102,6 +120,14 @@ def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats,
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
     # The common scale may be off: it moves all cameras, and is no fault of one.
     return sigma, np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+
+
+def _with_systematic(sigma: Floats, posterior: Floats, systematic: SystematicErrors | None) -> Floats:
+    """Standard deviations (c, 6) of how far corrections may be from what was given, if that is within its prior.
+
+    Errors of lens models turn and move a camera by more than a good calibration errs, and no repetition shows them.
+    """
+    return sigma if systematic is None else np.hypot(sigma, systematic.sigma_camera(posterior))
 
 
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:

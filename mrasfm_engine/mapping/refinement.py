@@ -186,7 +186,7 @@ def _assess(mapper: Mapper, result: Refinement, free_units: Bools, cancel: Cance
             options=solver_options(mapper, result),
             cancel=cancel,
         )
-    known = calibration_prior(mapper), mapper.state, result.directions
+    known = calibration_prior(mapper), mapper.state, result.directions, result.systematic
     result.miscalibrations = find_miscalibrations(*known)
     result.wrong_pair = find_wrong_pair(*known)
 

@@ -20,6 +20,7 @@ from mrasfm_engine.mapping.miscalibration import (
 )
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
+from mrasfm_engine.mapping.systematic_errors import SystematicErrors
 from mrasfm_engine.mapping.unit_registration import Registration
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -143,6 +144,36 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
     assert "cameras left and right are turned by 3.00 deg" in said.what
     at_rest = replace(state, camera_rotation=prior.rotation)
     assert find_wrong_pair(prior, at_rest, directions) is None
+    # Lenses that leave 0.4 deg of a rotation open explain 1.5 deg under five sigmas of 0.2 and 0.4 deg.
+    assert find_wrong_pair(prior, state, directions, lens_errors(0.1, cameras=2)) is not None
+    assert find_wrong_pair(prior, state, directions, lens_errors(0.4, cameras=2)) is None
+
+
+def lens_errors(sigma_deg: float, *, cameras: int) -> SystematicErrors:
+    """Errors of lens models that turn every camera by so much about each axis, and move none."""
+    by_lenses = np.zeros((cameras, 7))
+    by_lenses[:, :3] = np.radians(sigma_deg) ** 2
+    return SystematicErrors(by_lenses=by_lenses, by_others=np.zeros_like(by_lenses), lens_px=1.0, factor=1.0)
+
+
+@pytest.mark.parametrize(("lenses_deg", "wrong"), [(0.02, [1]), (0.1, [])])
+def test_what_lens_models_turn_a_camera_by_is_no_miscalibration(lenses_deg: float, wrong: list[int]) -> None:
+    """A calibration that is declared to 0.02 deg, and a camera that is found 0.3 deg off."""
+    mapper = make_model(make_simulated_drive(units=4, cameras=4, points=200))
+    prior = replace(calibration_prior(mapper), sigma_rotation_rad=np.radians([0.02] * 4))
+    rotation = prior.rotation.copy()
+    rotation[1] = se3.exp_so3(np.radians([0.3, 0.0, 0.0])) @ rotation[1]
+    state = replace(mapper.state, camera_rotation=rotation, camera_position_m=prior.position_m)
+    directions = Observability(
+        observed=np.ones((4, 6), dtype=np.bool_),
+        ratio=np.full((4, 6), 0.1),
+        scale_observed=False,
+        scale_only_prior=False,
+        sigma_scale=0.01,
+        prior_sigma_scale=0.01,
+    )
+    found = find_miscalibrations(prior, state, directions, lens_errors(lenses_deg, cameras=4))
+    assert [one.camera for one in found] == wrong
 
 
 @pytest.mark.parametrize(("about_y_deg", "wrong"), [(0.3, []), (1.5, [1])])
