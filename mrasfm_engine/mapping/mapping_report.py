@@ -122,8 +122,10 @@ def covered_camera_findings(mapper: Mapper, log: MappingLog) -> list[Finding]:
 
 
 def idle_camera_findings(mapper: Mapper) -> list[Finding]:
-    """Findings on cameras whose images match one another and observe hardly anything of the finished scene."""
-    matched = np.bincount(mapper.keypoints.image, minlength=len(mapper.image_unit)) >= MIN_CAMERA_MATCHES
+    """Findings on cameras whose images observe hardly anything of the finished scene: with matches, and without."""
+    of_tracks = mapper.keypoints.image[mapper.tracks.of_keypoint >= 0]
+    matched = np.bincount(of_tracks, minlength=len(mapper.image_unit)) >= MIN_CAMERA_MATCHES
+    idle = _is_poorly_seen(mapper)
     return [
         warning(
             "camera-without-points",
@@ -132,7 +134,16 @@ def idle_camera_findings(mapper: Mapper) -> list[Finding]:
             "They have hardly any part in the scene. Look at them: they may be another camera's, or rig_from_cam or "
             "params may be.",
         )
-        for name, found, posed in _cameras_all_along(mapper, _is_poorly_seen(mapper) & matched)
+        for name, found, posed in _cameras_all_along(mapper, idle & matched)
+    ] + [
+        warning(
+            "camera-without-matches",
+            f"{found} of {posed} images of camera {name} have under {MIN_CAMERA_MATCHES} keypoints that match another "
+            "image",
+            "They have no part in the scene, and their poses are as rig_from_cam says. Look at them: they may be dark, "
+            "without texture or noise alone, and the lens covered.",
+        )
+        for name, found, posed in _cameras_all_along(mapper, idle & ~matched)
     ]
 
 

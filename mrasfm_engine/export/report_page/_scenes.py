@@ -42,6 +42,7 @@ AGAINST_CALIBRATION = frozenset(
         "calibration-unexplained",
         "camera-against-rig",
         "camera-miscalibrated",
+        "camera-without-matches",
         "camera-without-points",
         "cameras-backwards",
         "focal-beyond-prior",

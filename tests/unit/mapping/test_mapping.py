@@ -412,6 +412,20 @@ def test_a_camera_that_observes_hardly_a_point_all_along_is_a_finding() -> None:
     assert idle_camera_findings(mapper) == []
 
 
+def test_a_camera_whose_images_match_nothing_is_a_finding() -> None:
+    """A lens cap that was left on, or a sensor that gives noise: the scene is sound without it."""
+    simulated = make_simulated_drive(units=8, cameras=3, points=300)
+    camera_of = [image.camera for image in simulated.drive.images]
+    of_others = [
+        pair for pair in true_matches(simulated) if 1 not in (camera_of[pair.image_a], camera_of[pair.image_b])
+    ]
+    mapper = with_true_poses(make_model(simulated, of_others), simulated, range(8))
+    mapper.complete()
+    (finding,) = idle_camera_findings(mapper)
+    assert finding.code == "camera-without-matches"
+    assert finding.what.startswith(f"8 of 8 images of camera {simulated.drive.cameras[1].name} have under")
+
+
 def test_single_images_that_contradict_their_unit_are_a_finding() -> None:
     """One image of another camera in one frame: its unit has its pose from the others, and nothing else says so."""
     simulated = make_simulated_drive(units=8, cameras=3, points=300)
