@@ -59,9 +59,17 @@ class CalibrationPrior:
         """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
         return _corrections(state.camera_rotation, state.camera_position_m, self.rotation, self.position_m)
 
-    def with_weights(self, state: State) -> CalibrationPrior:
-        """This prior with the gauge's weights renewed from the corrections of a state."""
-        return replace(self, gauge_weights=robust_gauge_weights(self._whitened(state)[0]))
+    def with_weights(self, state: State, observing: Bools | None = None) -> CalibrationPrior:
+        """This prior with the gauge's weights renewed from the corrections of a state.
+
+        Cameras that are not among the `observing` (c,), if there are any of these, have no weight.
+        """
+        counts = np.ones(len(self.rotation), dtype=np.bool_)
+        if observing is not None and observing.any():
+            counts = observing
+        weights = np.zeros(len(counts))
+        weights[counts] = robust_gauge_weights(self._whitened(state)[0][counts])
+        return replace(self, gauge_weights=weights)
 
     def weights_of_places(self, state: State) -> Floats:
         """Weights (c,) of the loss on each camera's place: 1 for one as given, near 0 for one far from there."""

@@ -40,6 +40,22 @@ def calibration_prior(mapper: Mapper, held: Bools | None = None) -> CalibrationP
     return prior.with_weights(mapper.state)
 
 
+def prior_among_observing_cameras(mapper: Mapper) -> CalibrationPrior:
+    """The prior whose gauge is the mean of the cameras that observe points.
+
+    Nothing but the prior knows where one is that observes none: beside a mean with such a one in it, no camera's pose
+    is known better than that.
+    """
+    return calibration_prior(mapper).with_weights(mapper.state, observing_cameras(mapper))
+
+
+def observing_cameras(mapper: Mapper) -> Bools:
+    """Cameras (c,) that observe a point of the scene."""
+    counts = np.bincount(mapper.keypoints.camera[mapper.is_inlier], minlength=len(mapper.camera_kind))
+    result: Bools = counts > 0
+    return result
+
+
 def heading_change_deg(mapper: Mapper) -> float:
     """Spread of the registered units' forward directions, degrees."""
     forward = mapper.state.unit_rotation[mapper.registered][:, :, 0]
@@ -189,9 +205,10 @@ def _share_of_baselines(mapper: Mapper, certainty: Covariances) -> tuple[float, 
 
     One and zero where the covariance does not say it.
     """
-    centred = _about_their_mean(mapper.state.camera_position_m)
-    of_camera = np.zeros((len(centred), 6))
-    of_camera[:, 3:] = centred / max(float((centred**2).sum()), MIN_BASELINES_M2)
+    observes = observing_cameras(mapper)
+    centred = _about_their_mean(mapper.state.camera_position_m[observes])
+    of_camera = np.zeros((len(observes), 6))
+    of_camera[observes, 3:] = centred / max(float((centred**2).sum()), MIN_BASELINES_M2)
     length = of_camera.ravel()  # derivative of the baselines' common length, relative
     if certainty.scale_with_calibration.shape != length.shape:
         return 1.0, 0.0
@@ -207,7 +224,7 @@ def of_cameras_alone(mapper: Mapper, certainty: Covariances) -> Covariances:
     cameras = len(mapper.camera_kind)
     if certainty.calibration.shape != (6 * cameras, 6 * cameras) or not np.isfinite(certainty.calibration).all():
         return certainty
-    prior = calibration_prior(mapper)
+    prior = prior_among_observing_cameras(mapper)
     calibration = prior.without_gauge(certainty.calibration)
     sigma_camera = certainty.sigma_camera.copy()
     sigma_camera[:, :6] = np.sqrt(np.maximum(np.diagonal(calibration), 0.0)).reshape(cameras, 6)

@@ -30,7 +30,7 @@ from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRIN
 from mrasfm_engine.bundle_adjustment.shared_errors import information_of_terms
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
 from mrasfm_engine.geometry.camera_model import unproject_pixels
-from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.calibration import prior_among_observing_cameras
 from mrasfm_engine.mapping.intrinsics import problem_of_all_intrinsics
 from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX, lens_sigmas
 from mrasfm_engine.mapping.mapper import Mapper
@@ -131,7 +131,9 @@ def _by_camera(mapper: Mapper, moments: Floats, place: Ints, dof: int) -> Floats
     of_all = np.zeros((dof * len(mapper.camera_kind),) * 2)
     of_all[np.ix_(place, place)] = moments
     first = dof * np.arange(len(mapper.camera_kind))
-    poses = calibration_prior(mapper).without_gauge(of_all[np.ix_(*[(first[:, None] + np.arange(6)).ravel()] * 2)])
+    poses = prior_among_observing_cameras(mapper).without_gauge(
+        of_all[np.ix_(*[(first[:, None] + np.arange(6)).ravel()] * 2)]
+    )
     times_s2 = np.diagonal(of_all)[first + TIME] if dof > TIME else np.zeros(len(first))
     return np.maximum(np.column_stack([np.diagonal(poses).reshape(-1, 6), times_s2]), 0.0)
 

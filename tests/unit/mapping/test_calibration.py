@@ -13,6 +13,7 @@ from mrasfm_engine.mapping.calibration import (
     calibration_prior,
     hold_baselines,
     is_straight,
+    of_cameras_alone,
     resolve_scale,
     scale_of_baselines,
     scale_scene,
@@ -230,6 +231,21 @@ def test_baselines_are_held_where_the_scene_follows_them(sigma_m: float) -> None
     else:
         assert 1.0 / 1.1 - 0.01 < longer < 1.0 / 1.1 + 0.03
         assert scale_of_baselines(mapper)[0] == pytest.approx(1.0)
+
+
+def test_a_camera_that_observes_nothing_leaves_the_others_as_certain_as_they_are() -> None:
+    mapper = true_model(cameras=4)
+    mapper.is_inlier &= mapper.keypoints.camera != 3
+    problem, _ = mapper.problem(
+        np.arange(UNITS) > 0,
+        free_cameras=np.ones(4, dtype=np.bool_),
+        terms=[calibration_prior(mapper)],
+        options=SolverOptions(sigma_px=0.5),
+    )
+    certainty = of_cameras_alone(mapper, covariances(problem, problem.state, shared_errors=False))
+    sigma_deg = np.degrees(certainty.sigma_camera[:, :3])
+    assert (sigma_deg[:3] < 0.03).all()  # beside a mean of all four, 0.05 to 0.06
+    assert (sigma_deg[3] > 0.05).all()
 
 
 def test_images_of_a_stereo_pair_know_the_scale_but_for_its_baseline() -> None:
