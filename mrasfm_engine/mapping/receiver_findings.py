@@ -60,6 +60,23 @@ def jump_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
     ]
 
 
+def outlier_findings(placement: Placement) -> list[Finding]:
+    """The finding that most positions contradict the scene, which lies where the few others say."""
+    judged = placement.inlier[~np.isin(placement.units, placement.blended)]
+    used = int(judged.sum())
+    if placement.prior is None or 2 * used >= len(judged):
+        return []
+    return [
+        warning(
+            "gnss-mostly-outliers",
+            f"{len(judged) - used} of {len(judged)} positions of the receiver contradict the scene, which lies where "
+            f"the other {used} say",
+            "Scene or receiver are wrong, and the sigmas hold for neither: look at the units without a pose and at the "
+            "path in report.html, check gnss.samples, or compare with a run that ignores GNSS.",
+        )
+    ]
+
+
 def _step_m(off_m: Floats, k: int) -> float:
     """Distance between the residuals (n, 3) before sample k and those from it on."""
     before, after = off_m[max(0, k - AROUND) : k], off_m[k : k + AROUND]

@@ -19,7 +19,12 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.implausible_lengths import length_findings
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.receiver_findings import jump_findings, refusal_findings, rough_scale_findings
+from mrasfm_engine.mapping.receiver_findings import (
+    jump_findings,
+    outlier_findings,
+    refusal_findings,
+    rough_scale_findings,
+)
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -144,6 +149,7 @@ def _refined(
     if refined.placement is not None:
         findings += refined.placement.findings
         findings += refusal_findings(refined.placement) + jump_findings(mapper, refined.placement)
+        findings += outlier_findings(refined.placement)
     findings += rough_scale_findings(mapper, refined.scale_of_rough_poses)
     if refined.intrinsics is not None:
         findings += refined.intrinsics.findings(mapper)

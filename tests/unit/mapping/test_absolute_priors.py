@@ -17,7 +17,7 @@ from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import place_by_gnss
-from mrasfm_engine.mapping.receiver_findings import jump_findings, rough_scale_findings
+from mrasfm_engine.mapping.receiver_findings import jump_findings, outlier_findings, rough_scale_findings
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import RoughPose, RoughTrajectory
@@ -286,6 +286,10 @@ def test_a_receiver_whose_error_jumps_neither_scales_nor_bends_the_scene(sigma_m
     assert result.placement is not None
     assert result.placement.jumps.tolist() == [11]
     assert [finding.code for finding in jump_findings(mapper, result.placement)] == ["gnss-error-jumps"]
+    assert outlier_findings(result.placement) == []  # what jumps together is no outlier
+    few = replace(result.placement, inlier=np.arange(len(result.placement.inlier)) < 5)
+    (finding,) = outlier_findings(few)
+    assert finding.what.startswith(f"{UNITS - 5} of {UNITS} positions of the receiver contradict the scene")
     aligned = align_rigid(simulated.world_from_rig[:, :3, 3], mapper.state.unit_position_m)
     off_m = se3.apply(aligned.a_from_b, mapper.state.unit_position_m) - simulated.world_from_rig[:, :3, 3]
     assert np.sqrt((off_m**2).sum(1).mean()) < 0.1
