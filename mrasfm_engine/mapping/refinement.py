@@ -62,6 +62,7 @@ from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
 BOTH_RIGHT_SIGMAS = 2.0  # of the scales by rough poses and by the rig as given, within which both may be right
+MIN_UNITS_WITH_SCALE = 3  # of one camera, that positions place
 BEHIND = 0.1  # of an observation's sigma, that a scene may stay behind baselines that are held
 
 
@@ -109,15 +110,25 @@ def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel
     if calibrated is None:
         absolute.doubt_the_rig(mapper)
     if not result.is_placed and mapper.drive.has_single_camera:
-        raise ReconstructionError(
-            "one camera tells no scale, and neither GNSS nor rough poses could: "
-            + (result.placement.reason if result.placement is not None else "the drive has none that are usable"),
-            remedy="Give a second camera with its baseline, or positions along the vehicle's trajectory.",
-            code="no-metric-scale",
-        )
+        raise _no_scale_of_one_camera(mapper, result)
     if calibrated is not None:
         take_calibration(mapper, calibrated)
         mapper.complete()
+
+
+def _no_scale_of_one_camera(mapper: Mapper, result: Refinement) -> ReconstructionError:
+    """The error that nothing tells the scale; where the scene has hardly a unit, positions are not what is missing."""
+    registered, units = int(mapper.registered.sum()), len(mapper.registered)
+    reason = result.placement.reason if result.placement is not None else "the drive has none that are usable"
+    remedy = "Give a second camera with its baseline, or positions along the vehicle's trajectory."
+    if registered < MIN_UNITS_WITH_SCALE:
+        reason = f"images link only {registered} of {units} units, and {MIN_UNITS_WITH_SCALE} are needed"
+        remedy = "Check that consecutive frames show the same scene, and that images are sharp and not mixed up."
+    return ReconstructionError(
+        f"one camera tells no scale, and neither GNSS nor rough poses could: {reason}",
+        remedy=remedy,
+        code="no-metric-scale",
+    )
 
 
 def _decide_what_varies(

@@ -6,7 +6,7 @@ import pytest
 from mrasfm_engine.bundle_adjustment.marginal_covariances import covariances
 from mrasfm_engine.bundle_adjustment.priors import PositionPrior
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
-from mrasfm_engine.errors import CancelledError
+from mrasfm_engine.errors import CancelledError, ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import (
     assess_calibration,
@@ -22,6 +22,7 @@ from mrasfm_engine.mapping.calibration import (
 )
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
+from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.rough_placement import place_by_rough_poses
 from mrasfm_engine.matching.verification import parallax_rad
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
@@ -146,6 +147,16 @@ def test_parallax_is_what_rotation_does_not_explain() -> None:
     still, moved = points @ turn.T, (points - [0.3, 0, 0.5]) @ turn.T
     assert parallax_rad(a, still / np.linalg.norm(still, axis=1, keepdims=True)) < 1e-7
     assert 0.005 < parallax_rad(a, moved / np.linalg.norm(moved, axis=1, keepdims=True)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("registered", "words"), [(2, "images link only 2 of 10 units"), (UNITS, "the drive has none that are usable")]
+)
+def test_one_camera_without_a_scale_says_what_is_missing(registered: int, words: str) -> None:
+    mapper = true_model(cameras=1)
+    mapper.forget(np.arange(registered, UNITS))
+    with pytest.raises(ReconstructionError, match=words):
+        refine(mapper)
 
 
 def test_rough_poses_place_the_model_and_a_single_one_does_not() -> None:
