@@ -237,7 +237,7 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
         result["gnss"] = {
             "units_used": int(placement.inlier.sum()),
             "outliers_at_us": [int(t) for t in times],
-            "residual_rms_m": float(np.sqrt((placement.off_m[placement.inlier] ** 2).sum(1).mean())),
+            "residual_rms_m": float(np.sqrt((placement.residuals_m[placement.inlier] ** 2).sum(1).mean())),
             "noise_factor": placement.noise_factor,
             "errors_in_declared_sigmas": {
                 "white": placement.errors.white,

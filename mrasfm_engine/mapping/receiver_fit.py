@@ -90,6 +90,12 @@ class Placement:
         return result
 
     @property
+    def residuals_m(self) -> Floats:
+        """Scene minus measured (n, 3), without what the receiver's error jumps by."""
+        result: Floats = self.off_m - self.level_m[segment_of(self.units, self.jumps)]
+        return result
+
+    @property
     def is_contradicted(self) -> bool:
         """True where the scene does not have the shape of most positions."""
         if self.prior is None:

@@ -16,6 +16,7 @@ from mrasfm_engine.mapping.absolute_priors import LOCAL_POSITIONS, AbsolutePrior
 from mrasfm_engine.mapping.calibration import scale_scene
 from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.mapping_report import describe_refinement
 from mrasfm_engine.mapping.placement import place_by_gnss
 from mrasfm_engine.mapping.receiver_findings import jump_findings, outlier_findings, rough_scale_findings
 from mrasfm_engine.mapping.refinement import refine
@@ -287,6 +288,7 @@ def test_a_receiver_whose_error_jumps_neither_scales_nor_bends_the_scene(sigma_m
     assert result.placement.jumps.tolist() == [11]
     assert [finding.code for finding in jump_findings(mapper, result.placement)] == ["gnss-error-jumps"]
     assert outlier_findings(result.placement) == []  # what jumps together is no outlier
+    assert describe_refinement(mapper, result)["gnss"]["residual_rms_m"] < 0.5  # of 3.2 m by which it jumps
     few = replace(result.placement, inlier=np.arange(len(result.placement.inlier)) < 5)
     (finding,) = outlier_findings(few)
     assert finding.what.startswith(f"{UNITS - 5} of {UNITS} positions of the receiver contradict the scene")
