@@ -64,8 +64,7 @@ class FeatureConfig(_Section):
         0.02, description="of SIFT; half of its usual value, so that asphalt and shade yield keypoints too"
     )
     class_margin_px: CountOrZero = Field(
-        2,
-        description="keypoints have no class whose outline is nearer than this to the border of a class in the mask",
+        2, description="keypoints nearer than this to the border of a class in the mask have no class"
     )
     own_car: bool = Field(
         True,
