@@ -232,12 +232,13 @@ def _check_rig(manifest: DriveManifest) -> list[Finding]:
         "Check rig.body_axes, that rig_from_cam is the camera's pose in the rig, not its inverse, and that its "
         "quaternion ends with w; camera axes are x right, y down, z forward."
     )
-    level = np.abs(axes[:, 1] @ up) < np.sin(np.radians(LEVEL_DEG))
+    nearly_level, rise = np.sin(np.radians(LEVEL_DEG)), axes[:, 1] @ up
+    level, down = np.abs(rise) < nearly_level, rise < -nearly_level
     ahead = np.abs(axes[:, 1] @ forward) > np.cos(np.radians(LEVEL_DEG))
-    on_edge = np.abs(upright) < np.sin(np.radians(LEVEL_DEG))
+    on_edge = np.abs(upright) < nearly_level
     if not turned.all():
         return [warning("camera-turned", what, f"Nothing needs to be done where it is mounted so. {remedy}")]
-    if (axes[:, 1] @ up < -np.sin(np.radians(LEVEL_DEG))).all():
+    if down.all():
         return [warning("rig-axes", what, f"Nothing needs to be done where they look down at the road. {remedy}")]
     if level.all() and ahead.any() and on_edge.all():
         return [warning("rig-axes", what, f"Nothing needs to be done where they stand on edge. {remedy}")]

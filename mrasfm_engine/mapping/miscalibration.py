@@ -56,10 +56,9 @@ def find_wrong_pair(
     corrections = np.where(directions.observed, prior.corrections(state), 0.0)
     if len(corrections) != 2:
         return None
-    sigma, posterior = _sigmas(prior, directions)
-    sigma = _with_systematic(sigma, posterior, systematic)
+    _, allowed, posterior = _sigmas(prior, directions, systematic)
     if not any(
-        _is_wrong(corrections[:, part], c, sigma=sigma[c, part], posterior=posterior[c, part], floor=np.inf)
+        _is_wrong(corrections[:, part], c, sigma=allowed[c, part], posterior=posterior[c, part], floor=np.inf)
         for c in range(2)
         for part in (slice(0, 3), slice(3, 6))
     ):
@@ -90,8 +89,7 @@ def find_miscalibrations(
         # What all cameras share is held, not observed, and one that is wrong has its part in how it is held.
         corrections = corrections - np.median(corrections, axis=0)
     corrections = np.where(directions.observed, corrections, 0.0)
-    sigma, posterior = _sigmas(prior, directions)
-    allowed = _with_systematic(sigma, posterior, systematic)
+    sigma, allowed, posterior = _sigmas(prior, directions, systematic)
     found = []
     for c in range(len(corrections)):
         verdicts = [
@@ -115,19 +113,18 @@ def find_miscalibrations(
     return found
 
 
-def _sigmas(prior: CalibrationPrior, directions: Observability) -> tuple[Floats, Floats]:
-    """Standard deviations (c, 6) of corrections before and after the drive."""
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
-    # The common scale may be off: it moves all cameras, and is no fault of one.
-    return sigma, np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
-
-
-def _with_systematic(sigma: Floats, posterior: Floats, systematic: SystematicErrors | None) -> Floats:
-    """Standard deviations (c, 6) of how far corrections may be from what was given, if that is within its prior.
+def _sigmas(
+    prior: CalibrationPrior, directions: Observability, systematic: SystematicErrors | None
+) -> tuple[Floats, Floats, Floats]:
+    """Standard deviations (c, 6) of corrections before the drive, of how far they may come out, and after it.
 
     Errors of lens models turn and move a camera by more than a good calibration errs, and no repetition shows them.
     """
-    return sigma if systematic is None else np.hypot(sigma, systematic.sigma_camera(posterior))
+    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    # The common scale may be off: it moves all cameras, and is no fault of one.
+    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+    allowed = sigma if systematic is None else np.hypot(sigma, systematic.sigma_camera(posterior))
+    return sigma, allowed, posterior
 
 
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:

@@ -38,6 +38,7 @@ from mrasfm_engine.mapping.moving_objects import drop_moving
 from mrasfm_engine.mapping.other_sizes import parts_of
 from mrasfm_engine.mapping.placement import compare_with_rig
 from mrasfm_engine.mapping.receiver_findings import contradicts_rig
+from mrasfm_engine.mapping.receiver_fit import MIN_POSITIONS
 from mrasfm_engine.mapping.refinement_result import (
     Refinement,
     certainty_of,
@@ -62,7 +63,6 @@ from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 OF_THE_LARGEST = "it is that of the drive's largest component"
 BOTH_RIGHT_SIGMAS = 2.0  # of the scales by rough poses and by the rig as given, within which both may be right
-MIN_UNITS_WITH_SCALE = 3  # of one camera, that positions place
 BEHIND = 0.1  # of an observation's sigma, that a scene may stay behind baselines that are held
 
 
@@ -121,8 +121,8 @@ def _no_scale_of_one_camera(mapper: Mapper, result: Refinement) -> Reconstructio
     registered, units = int(mapper.registered.sum()), len(mapper.registered)
     reason = result.placement.reason if result.placement is not None else "the drive has none that are usable"
     remedy = "Give a second camera with its baseline, or positions along the vehicle's trajectory."
-    if registered < MIN_UNITS_WITH_SCALE:
-        reason = f"images link only {registered} of {units} units, and {MIN_UNITS_WITH_SCALE} are needed"
+    if registered < MIN_POSITIONS:
+        reason = f"images link only {registered} of {units} units, and {MIN_POSITIONS} are needed"
         remedy = "Check that consecutive frames show the same scene, and that images are sharp and not mixed up."
     return ReconstructionError(
         f"one camera tells no scale, and neither GNSS nor rough poses could: {reason}",
