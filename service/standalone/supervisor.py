@@ -359,7 +359,7 @@ class _Guard:
         self._process, self.start_at_s = None, math.inf
         try:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", orphan_reaper.__file__],
+                [sys.executable, "-I", "-S", orphan_reaper.__file__, *map(str, self._groups)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
@@ -369,9 +369,6 @@ class _Guard:
             )
         except OSError:  # the machine is short of something; until it is there, the kernel alone watches over us
             self.start_at_s = time.monotonic() + FIRST_DELAY_S
-            return
-        for group in self._groups:
-            self._tell(f"+{group}\n")
 
     def close(self) -> None:
         """Release the reaper; it kills what is still in its list, which after an orderly stop is nothing."""

@@ -21,6 +21,7 @@ from typing import Any
 import psutil
 import pytest
 
+from service.standalone import orphan_reaper
 from service.standalone.supervisor import ChildSpec, Supervisor
 from service.storage.data_folder import DataFolderError, exclusive_use
 from tests.helpers.process_tree import children_of
@@ -328,6 +329,14 @@ def test_a_killed_guard_is_replaced_and_knows_what_to_do(world: World) -> None:
         wait_for(lambda pid=pid: is_gone(pid))
 
 
+def test_a_guard_knows_the_groups_it_is_started_with_before_it_is_told_any() -> None:
+    waiting = [sys.executable, "-I", "-S", "-c", "input()"]
+    with subprocess.Popen(waiting, stdin=subprocess.PIPE, process_group=0) as left:
+        argv = [sys.executable, "-I", "-S", orphan_reaper.__file__, str(left.pid)]
+        subprocess.run(argv, stdin=subprocess.DEVNULL, check=True, timeout=TIMEOUT_S)
+        assert left.wait(TIMEOUT_S) == -signal.SIGKILL
+
+
 def test_without_its_logs_it_goes_on(world: World) -> None:
     supervisor = world.start_ready(world.child("worker"))
     logs = world.folder / "logs"
@@ -364,7 +373,7 @@ def test_a_passing_lack_of_processes_ends_nothing(tmp_path: Path, monkeypatch: p
     real, refused, said = subprocess.Popen, [], []
 
     def scarce(argv: list[str], **options: Any) -> subprocess.Popen[bytes]:
-        if "orphan_reaper" in argv[-1] and len(refused) < 2:
+        if orphan_reaper.__file__ in argv and len(refused) < 2:
             refused.append(argv)
             raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
         return real(argv, **options)
