@@ -14,9 +14,10 @@ with the Sampson distances e of `sampson`. P is what simultaneous images have le
 alone determine the directions and rotations of the motions. Their lengths count where cameras stand apart in a vehicle
 that turns, and are those of a vehicle of unknown speed.
 
-Errors within the prior's standard deviation are left to the adjustment. Beyond, a correction is used if it is
-significant along one direction at least, and brings the directions of motion that cameras see nearer to one another. Of
-roll about a straight street only matches between two cameras at different times say something.
+Errors within the standard deviations of the prior and of the directions of motion that cameras see are left to the
+adjustment. Beyond, a correction is used if it is significant along one direction at least, and brings these directions
+nearer to one another. Of roll about a straight street only matches between two cameras at different times say
+something.
 
 These directions are those of the cameras, not of one point of the rig: as lengths are unknown, so is how much of their
 difference comes from lever arms. Round a circle of 5 m a camera at the rear axle and one 1.7 m ahead of it see
@@ -40,7 +41,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.matching.relative_pose import UncertainRig
-from mrasfm_engine.matching.robust_correction import Correction, Errors, most_likely_correction
+from mrasfm_engine.matching.robust_correction import MEDIAN_SIGMAS, Correction, Errors, most_likely_correction
 from mrasfm_engine.matching.sampson import epipolar_derivatives
 from mrasfm_engine.matching.simultaneous import (
     INDEPENDENT_MATCHES,
@@ -192,18 +193,35 @@ def estimate_rig_by_motion(
     result = MotionEstimate(
         rig_from_cam=rig.rig_from_cam, motions=len(problem.alone), apart_before_rad=before, apart_rad=before
     )
-    # What the prior lets expect is left to the adjustment, which weighs it against everything else.
-    expected = np.hypot(problem.sigma_rad[:, None], problem.sigma_rad)
+    # What prior and noise let expect is left to the adjustment, which weighs it against everything else.
+    expected, by_prior = problem.expected_apart_rad, np.hypot(problem.sigma_rad[:, None], problem.sigma_rad)
     # A lorry that fills one camera's images moves as well, but not between many pairs of units.
     if len(problem.alone) < MIN_UNITS or (before <= expected).all():
         return result
     for begin in problem.starts():
         corrected = problem.begun_with(problem.demanded(problem.most_likely(begin)))
         after = corrected.apart_rad
-        is_better = ((before > expected) & (after < before)).any() and (after <= np.maximum(before, expected)).all()
+        is_better = ((before > expected) & (after < before)).any() and (after <= np.maximum(before, by_prior)).all()
         if is_better and corrected.is_calibration_of(rig):
             return replace(result, rig_from_cam=corrected.rig_from_cam, apart_rad=after)
     return result
+
+
+@dataclass(frozen=True, kw_only=True)
+class _OwnMotion:
+    """A motion as one camera sees it.
+
+    `turn` (3, 3) leads from the later to the earlier unit, `direction` (3,) is that in which the rig moves, both in rig
+    axes, and `variance_rad2` is of the angle by which the direction errs.
+    """
+
+    turn: Floats
+    direction: Floats
+    variance_rad2: float
+
+    def turned(self, by: Floats) -> _OwnMotion:
+        """The motion under a rig whose camera is turned (3, 3)."""
+        return replace(self, turn=by @ self.turn @ by.T, direction=by @ self.direction)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -213,7 +231,7 @@ class _MotionProblem:
     rig_from_cam: Floats  # (c, 4, 4)
     turn_root: Floats  # (3 c, 3 c) root of the covariance of the cameras' turns, rad
     found: Sequence[MotionMatches]
-    alone: Sequence[Mapping[int, tuple[Floats, Floats]]]  # (m,) what `_start` gives for each camera
+    alone: Sequence[Mapping[int, _OwnMotion]]  # (m,) by camera
     usual_m: Floats  # (m,)
     focal_px: Floats  # (c,)
     max_error_px: float
@@ -223,9 +241,10 @@ class _MotionProblem:
         rig: UncertainRig, found: Sequence[MotionMatches], *, elapsed_s: Floats, focal_px: Floats, max_error_px: float
     ) -> _MotionProblem:
         """The problem of those motions that a camera determines by itself, and another one or matches of both."""
-        alone: dict[int, dict[int, tuple[Floats, Floats]]] = {}
+        alone: dict[int, dict[int, _OwnMotion]] = {}
         for one in found:
-            motion = _start(rig, one, max_error_px / focal_px[one.camera_a]) if one.camera_a == one.camera_b else None
+            pixel_rad = 1.0 / float(focal_px[one.camera_a])
+            motion = _own_motion(rig, one, pixel_rad, max_error_px) if one.camera_a == one.camera_b else None
             if motion is not None:
                 alone.setdefault(one.motion, {})[one.camera_a] = motion
         across = {one.motion for one in found if one.camera_a != one.camera_b}
@@ -248,10 +267,21 @@ class _MotionProblem:
         """Medians (c, c) of the angles between the directions of motion that two cameras see by themselves."""
         result = np.zeros((len(self.focal_px),) * 2)
         for a, b in combinations(range(len(result)), 2):
-            cosine = [float(of[a][1] @ of[b][1]) for of in self.alone if a in of and b in of]
+            cosine = [float(of[a].direction @ of[b].direction) for of in self.alone if a in of and b in of]
             if cosine:
                 result[a, b] = result[b, a] = np.arccos(np.clip(np.median(cosine), -1.0, 1.0))
         return result
+
+    @property
+    def expected_apart_rad(self) -> Floats:
+        """The angles (c, c) that right cameras have: of what is uncertain of their turns, and of their directions."""
+        variance = self.sigma_rad[:, None] ** 2 + self.sigma_rad**2
+        for a, b in combinations(range(len(variance)), 2):
+            noise = [of[a].variance_rad2 + of[b].variance_rad2 for of in self.alone if a in of and b in of]
+            if noise:
+                variance[a, b] += np.median(noise)
+                variance[b, a] = variance[a, b]
+        return np.sqrt(variance)
 
     @cached_property
     def sigma_rad(self) -> Floats:
@@ -292,7 +322,7 @@ class _MotionProblem:
     def begun_with(self, x: Floats) -> _MotionProblem:
         """The problem of the cameras turned by x (3 c,)."""
         by = se3.exp_so3((self.turn_root @ x).reshape(-1, 3))
-        alone = [{c: (by[c] @ t @ by[c].T, by[c] @ w) for c, (t, w) in motions.items()} for motions in self.alone]
+        alone = [{camera: own.turned(by[camera]) for camera, own in motions.items()} for motions in self.alone]
         return replace(self, rig_from_cam=self.turned(x), alone=alone)
 
     def _middle(self, x: Floats) -> tuple[Floats, Floats]:
@@ -300,8 +330,8 @@ class _MotionProblem:
         begun = self.begun_with(x)
         turn, direction = np.empty((len(begun.alone), 3, 3)), np.empty((len(begun.alone), 3))
         for row, motions in enumerate(begun.alone):
-            turns, directions = zip(*motions.values(), strict=True)
-            turn[row], middle = robust_mean_rotation(np.stack(turns)), geometric_median(np.stack(directions))
+            turn[row] = robust_mean_rotation(np.stack([own.turn for own in motions.values()]))
+            middle = geometric_median(np.stack([own.direction for own in motions.values()]))
             direction[row] = middle / max(float(np.linalg.norm(middle)), 1e-9)
         return turn, direction
 
@@ -320,10 +350,10 @@ class _MotionProblem:
         direction = self._middle(np.zeros(self.turns))[1]
         off: list[list[Floats]] = [[np.zeros(3)] for _ in self.focal_px]
         for middle, motions in zip(direction, self.alone, strict=True):
-            for camera, (_, own) in motions.items():
-                across = np.cross(own, middle)
+            for camera, own in motions.items():
+                across = np.cross(own.direction, middle)
                 sine = max(float(np.linalg.norm(across)), 1e-9)
-                off[camera].append(np.arctan2(sine, own @ middle) / sine * across)
+                off[camera].append(np.arctan2(sine, own.direction @ middle) / sine * across)
         turned = np.concatenate([np.median(of_camera[1:] or of_camera, axis=0) for of_camera in off])
         result: Floats = np.linalg.pinv(self.turn_root) @ turned
         return result
@@ -382,14 +412,33 @@ class _MotionProblem:
         return float(1.0 / self.focal_px[[one.camera_a, one.camera_b]].min())
 
 
-def _start(rig: UncertainRig, one: MotionMatches, max_error: float) -> tuple[Floats, Floats] | None:
-    """Turn (3, 3) of the rig from the later to the earlier unit and its direction of motion (3,), by one camera."""
-    found = relative_pose(one.rays_a, one.rays_b, max_error=max_error)
+def _own_motion(rig: UncertainRig, one: MotionMatches, pixel_rad: float, max_error_px: float) -> _OwnMotion | None:
+    found = relative_pose(one.rays_a, one.rays_b, max_error=max_error_px * pixel_rad)
     if found is None:
         return None
     rotation, translation = found
     rig_from_cam = rig.rig_from_cam[one.camera_a, :3, :3]
-    return rig_from_cam @ rotation.T @ rig_from_cam.T, -rig_from_cam @ rotation.T @ translation
+    shift = -rotation.T @ translation
+    return _OwnMotion(
+        turn=rig_from_cam @ rotation.T @ rig_from_cam.T,
+        direction=rig_from_cam @ shift,
+        variance_rad2=_variance_of_direction(one, rotation.T, shift, MIN_SIGMA_PX * pixel_rad),
+    )
+
+
+def _variance_of_direction(one: MotionMatches, turn: Floats, shift: Floats, least_spread: float) -> float:
+    """Variance in rad^2 of the angle by which a motion's direction errs, which matches show together with its turn.
+
+    Matches count as at most `INDEPENDENT_MATCHES`, as lens models err alike in all motions: their number takes nothing
+    off that, nor do other motions.
+    """
+    error, derivatives, _ = epipolar_derivatives(np.eye(4), se3.transform(turn, shift), one.rays_a, one.rays_b)
+    spread = max(least_spread, float(np.median(np.abs(error))) / MEDIAN_SIGMAS)
+    across = np.linalg.svd(shift[None])[2][1:]  # the distances are the same at any length
+    by = np.column_stack([derivatives[:, 3:6] * SIGMA_TURN, derivatives[:, 6:] @ across.T * SIGMA_DIRECTION])
+    weight = min(1.0, INDEPENDENT_MATCHES / len(error)) / (spread**2 + error**2)
+    covariance = np.linalg.inv(np.eye(5) + by.T @ (weight[:, None] * by))
+    return float(SIGMA_DIRECTION**2 * np.trace(covariance[3:, 3:]))
 
 
 def _groups_that_share_views(rig: UncertainRig) -> list[int]:

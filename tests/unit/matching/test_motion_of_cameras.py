@@ -85,6 +85,17 @@ def test_a_rig_that_is_off_by_no_more_than_its_prior_lets_expect_stays_exactly_a
 
 
 @pytest.mark.parametrize("straight", [True, False])
+def test_a_rig_that_is_off_by_what_its_prior_and_the_noise_of_directions_let_expect_stays_as_given(
+    straight: bool,
+) -> None:
+    simulated = turned([0.0, 3.0, 0.0], straight=straight)
+    found = by_motion(simulated)
+    by_prior_deg = np.hypot(2.0, 2.0)
+    assert np.degrees(found.apart_before_rad[FRONT, BACK_LEFT]) > by_prior_deg
+    assert not found.is_corrected
+
+
+@pytest.mark.parametrize("straight", [True, False])
 @pytest.mark.parametrize("pitch_deg", [-6.0, 5.0, 9.0])
 def test_a_camera_without_a_common_view_that_is_turned_is_found(pitch_deg: float, straight: bool) -> None:
     simulated = turned([0.0, pitch_deg, 0.0], straight=straight)
