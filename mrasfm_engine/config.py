@@ -64,7 +64,8 @@ class FeatureConfig(_Section):
         0.02, description="of SIFT; half of its usual value, so that asphalt and shade yield keypoints too"
     )
     class_margin_px: CountOrZero = Field(
-        2, description="keypoints nearer than this to the border of a class in the mask have no class"
+        2,
+        description="keypoints have no class whose outline is nearer than this to the border of a class in the mask",
     )
     own_car: bool = Field(
         True,

@@ -19,7 +19,7 @@ from mrasfm_engine.io.images import mask_png, read_image_rgb, read_mask
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive, LeftOut
 from mrasfm_engine.scene.scene import ImageFeatures
-from mrasfm_engine.scene.semantics import class_codes, classes_at, confident_classes, usable_pixels
+from mrasfm_engine.scene.semantics import class_codes, classes_at, usable_pixels
 from mrasfm_engine.types import Bools, Bytes, Cancel, CountProgress
 from schemas import LabelMap
 
@@ -170,8 +170,8 @@ def features_by_image(
     """Features of every image of the drive, in the order of `drive.images`; those of few images exist at one time.
 
     Where an image has a semantic mask, nothing is extracted on moving things, the sky and the own car, and keypoints
-    have the class of what they show; within `class_margin_px` of another class they are unknown. Images without a mask
-    get theirs from `segmenter`, if there is one; it comes with their features.
+    have the class of what they show; those whose outline is within `class_margin_px` of another class are unknown.
+    Images without a mask get theirs from `segmenter`, if there is one; it comes with their features.
 
     Nothing is extracted where `own_cars` is True either: masks (h, w) by camera, as the pixels show the own car.
 
@@ -207,7 +207,8 @@ def features_by_image(
         if masked.codes is None:
             return found
         made_mask = None if masked.made_mask is None else mask_png(masked.made_mask)
-        classes = classes_at(confident_classes(masked.codes, class_margin_px), found.xy_px)
+        margin_px = class_margin_px + (0.0 if found.radius_px is None else found.radius_px)
+        classes = classes_at(masked.codes, found.xy_px, margin_px)
         return replace(found, classes=classes, made_mask=made_mask)
 
     count = len(drive.images)

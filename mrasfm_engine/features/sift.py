@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 
@@ -17,6 +19,9 @@ from mrasfm_engine.scene.scene import ImageFeatures
 from mrasfm_engine.types import Bools, Bytes, Floats
 
 SMALLEST_DESCRIPTOR_SUM = 1e-3
+# Of a disc over the smoothing at which it is an extremum (Lindeberg, Feature detection with automatic scale selection,
+# IJCV 1998).
+BLOB_RADIUS = math.sqrt(2.0)
 CANDIDATES = 2  # times the number wanted, of which those are chosen that cover the image
 
 
@@ -53,6 +58,7 @@ class SiftExtractor:
             xy_px=xy.astype(np.float32),
             descriptors=np.clip(np.round(root * DESCRIPTOR_SCALE), 0, 255).astype(np.uint8),
             colors=colors_at(rgb, xy),
+            radius_px=(BLOB_RADIUS * rgb.shape[1] / gray.shape[1] * keypoints.sigma_px).astype(np.float32),
         )
 
     def _gray(self, rgb: Bytes) -> Bytes:

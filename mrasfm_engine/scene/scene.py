@@ -27,6 +27,7 @@ class ImageFeatures:
     descriptors: Bytes | Floats32
     colors: Bytes  # (n, 3) red, green, blue at the keypoint
     scores: Floats32 | None = None  # (n,) a trained network's confidence
+    radius_px: Floats32 | None = None  # (n,) of what a keypoint is the middle of; None where an extractor has no scales
     # (n,) as `semantics.CLASS_CODES` numbers them; all unknown where not given
     classes: Bytes = field(default_factory=lambda: np.zeros(0, np.uint8))
     # (b,) bytes of a PNG with the ids that a network gave the image's pixels; None where no network ran

@@ -44,24 +44,22 @@ def usable_pixels(codes: Bytes) -> Bools:
     return result
 
 
-def confident_classes(codes: Bytes, margin_px: int) -> Bytes:
-    """The classes (h, w), unknown where another class is within `margin_px` in row or column: masks err at borders."""
-    if margin_px <= 0:
-        return codes
-    window = np.ones((2 * margin_px + 1, 2 * margin_px + 1), np.uint8)
-    # Beyond the image's edge nothing contradicts, so that the border is replicated, not filled.
-    low = cv2.erode(codes, window, borderType=cv2.BORDER_REPLICATE)
-    high = cv2.dilate(codes, window, borderType=cv2.BORDER_REPLICATE)
-    return np.where(low == high, codes, np.uint8(UNKNOWN))
+def classes_at(codes: Bytes, xy_px: NDArray[np.floating], margin_px: float | NDArray[np.floating] = 0.0) -> Bytes:
+    """The classes (n,) at keypoints (n, 2) whose top left pixel's centre is at (0.5, 0.5).
 
-
-def classes_at(codes: Bytes, xy_px: NDArray[np.floating]) -> Bytes:
-    """The classes (n,) at keypoints (n, 2) whose top left pixel's centre is at (0.5, 0.5)."""
+    Those are unknown that have another class within `margin_px`, one or (n,), in row or column: masks err at borders,
+    and what is around a keypoint has a say in its place.
+    """
     height, width = codes.shape
     column = np.clip(xy_px[:, 0].astype(np.int64), 0, width - 1)
     row = np.clip(xy_px[:, 1].astype(np.int64), 0, height - 1)
-    result: Bytes = codes[row, column]
-    return result
+    # Beyond the image's edge nothing contradicts, so that the border is replicated, not filled.
+    near, edge = np.ones((3, 3), np.uint8), cv2.BORDER_REPLICATE
+    is_border = cv2.erode(codes, near, borderType=edge) != cv2.dilate(codes, near, borderType=edge)
+    if not is_border.any():
+        return np.asarray(codes[row, column])
+    to_border_px = cv2.distanceTransform((~is_border).astype(np.uint8), cv2.DIST_C, 3)
+    return np.where(to_border_px[row, column] + 1.0 > margin_px, codes[row, column], np.uint8(UNKNOWN))
 
 
 def may_match(a: Bytes, b: Bytes) -> Bools:

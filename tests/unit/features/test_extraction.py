@@ -179,11 +179,12 @@ def test_keypoints_have_the_class_of_the_mask_and_none_near_its_borders(tmp_path
     first, second, *_ = extract_features(drive, SiftExtractor(FeatureConfig()), threads=1, class_margin_px=5)
     # Which keypoints there are does not depend on classes that may all have keypoints.
     np.testing.assert_array_equal(first.xy_px, plain.xy_px)
-    row = first.xy_px[:, 1]
-    assert (first.classes[row < border - 5] == 1).all()
-    assert (first.classes[row > border + 5] == ROAD).all()
-    near = np.abs(row - border) < 4
-    assert near.any()
+    row, radius_px = first.xy_px[:, 1], first.radius_px
+    assert radius_px is not None
+    assert (first.classes[row < border - 6 - radius_px] == 1).all()
+    assert (first.classes[row > border + 6 + radius_px] == ROAD).all()
+    near = np.abs(row - border) < 4 + radius_px
+    assert (near & (np.abs(row - border) > 6)).any()
     assert (first.classes[near] == UNKNOWN).all()
     # Masks for some images only: the others' keypoints have no class.
     assert len(second.classes) == len(second.xy_px) > 50
@@ -256,3 +257,14 @@ def test_keypoints_cover_the_image_although_the_strongest_crowd() -> None:
         assert len(xy) == 600
         shares[spread] = ((xy[:, 0] < 320) & (xy[:, 1] < 240)).mean()
     assert 0.1 < shares[True] < 0.75 * shares[False]
+
+
+@pytest.mark.parametrize("side_px", [240, 120])
+def test_the_radius_of_a_disc_is_that_in_the_image_also_where_it_is_reduced(side_px: int) -> None:
+    image = np.full((240, 240), 60, np.uint8)
+    cv2.circle(image, (120, 120), 18, 200, -1, cv2.LINE_AA)
+    found = SiftExtractor(FeatureConfig()).with_side(side_px).extract(np.dstack([image] * 3), None)
+    middle = np.linalg.norm(found.xy_px - 120.5, axis=1) < 2.0
+    assert middle.any()
+    assert found.radius_px is not None
+    np.testing.assert_allclose(found.radius_px[middle], 18.5, rtol=0.1)

@@ -9,7 +9,6 @@ from mrasfm_engine.scene.semantics import (
     UNKNOWN,
     class_codes,
     classes_at,
-    confident_classes,
     count_classes,
     majority_class,
     may_match,
@@ -45,11 +44,21 @@ def test_cityscapes_and_other_maps() -> None:
 def test_borders_between_classes_are_unknown_and_the_images_edge_is_not() -> None:
     codes = np.full((9, 12), STATIC, np.uint8)
     codes[:, 6:] = ROAD
-    sure = confident_classes(codes, 2)
+    xy_px = np.stack(np.meshgrid(np.arange(12), np.arange(9)), -1).reshape(-1, 2) + 0.5
+    sure = classes_at(codes, xy_px, 2).reshape(codes.shape)
     assert (sure[:, :4] == STATIC).all()
     assert (sure[:, 4:8] == UNKNOWN).all()
     assert (sure[:, 8:] == ROAD).all()
-    assert confident_classes(codes, 0) is codes
+    np.testing.assert_array_equal(classes_at(codes, xy_px).reshape(codes.shape), codes)
+    uniform = np.full_like(codes, ROAD)
+    assert (classes_at(uniform, xy_px, 100) == ROAD).all()
+
+
+def test_each_keypoint_has_a_margin_of_its_own() -> None:
+    codes = np.full((9, 12), STATIC, np.uint8)
+    codes[:, 6:] = ROAD
+    xy_px = np.array([[3.5, 4.5], [3.5, 4.5], [9.5, 4.5], [9.5, 4.5]])
+    assert classes_at(codes, xy_px, np.array([2.9, 3.0, 3.9, 4.0])).tolist() == [STATIC, UNKNOWN, ROAD, UNKNOWN]
 
 
 def test_the_class_of_a_keypoint_is_that_of_the_pixel_it_lies_in() -> None:
