@@ -5,8 +5,9 @@ Two motions of the cameras change no image, whatever the drive: all cameras move
 its inverse), and all moved away from their mean place by one factor (units and points move along). The adjustment holds
 the first; the second, the scale, is as good as the baselines' prior and positions make it. Neither says anything about
 one camera among the others, so a camera's direction is judged with both held: it is observed where the posterior
-standard deviation is well below what the prior alone would leave. Where a direction is nothing but such a motion (the
-baseline of two cameras is their scale), it is not observed.
+standard deviation is well below what the prior alone would leave. That is what was declared, but of a camera that the
+drive shows far from where it was given no more than the loss has left. Where a direction is nothing but such a motion
+(the baseline of two cameras is their scale), it is not observed.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ class Observability:
     ratio: (
         Floats  # (c, 6) posterior over prior sigma of the same; NaN where nothing of the direction is the camera's own
     )
+    prior_sigma: Floats  # (c, 6) rad and m, see `CalibrationPrior.sigmas_left`
     scale_observed: bool  # whether positions know the size of the rig better than its prior does
     scale_only_prior: bool  # or say nothing of it at all
     sigma_scale: float  # posterior, relative, of the cameras' distances
@@ -63,6 +65,7 @@ def assess_directions(
     sigma_translation_m: Floats,
     placed: bool,
     weight: Floats | None = None,
+    sigma_left: Floats | None = None,
 ) -> Observability:
     """Compare the posterior of all cameras' poses with their prior.
 
@@ -81,18 +84,23 @@ def assess_directions(
     weight
         Weights (c,) that the prior of places has left in the adjustment, of which cameras far from where they were
         given keep little: positions may well know the length of their baselines better than that.
+    sigma_left
+        Standard deviations (c, 6) that the prior has left of rotations and translations: see
+        `CalibrationPrior.sigmas_left`.
     """
     cameras = len(position_m)
+    sigma = np.repeat(np.stack([sigma_rotation_rad, sigma_translation_m], 1), 3, axis=1)
+    prior_sigma = sigma if sigma_left is None else sigma_left
     if not np.isfinite(covariance).all():
         return Observability(
             observed=np.zeros((cameras, 6), dtype=np.bool_),
             ratio=np.full((cameras, 6), np.inf),
+            prior_sigma=prior_sigma,
             scale_observed=False,
             scale_only_prior=not placed,
             sigma_scale=np.inf,
             prior_sigma_scale=np.inf,
         )
-    sigma = np.repeat(np.stack([sigma_rotation_rad, sigma_translation_m], 1), 3, axis=1)
     posterior = covariance / np.outer(sigma.ravel(), sigma.ravel())
     # The mean that is held is one of whitened corrections, so in these all common motions are alike.
     prior = np.asarray(np.kron(np.eye(cameras) - 1.0 / cameras, np.eye(6)), dtype=np.float64)
@@ -112,9 +120,11 @@ def assess_directions(
             prior, posterior = _given(prior, functional), _given(posterior, functional)
     own, left = np.diagonal(prior), np.maximum(np.diagonal(posterior), 0.0)
     ratio = np.where(own > MIN_OWN_SHARE, np.sqrt(left / np.maximum(own, MIN_OWN_SHARE)), np.nan).reshape(cameras, 6)
+    ratio = ratio * sigma / prior_sigma
     return Observability(
         observed=np.nan_to_num(ratio, nan=np.inf) < OBSERVED_RATIO,
         ratio=ratio,
+        prior_sigma=prior_sigma,
         scale_observed=scale_observed,
         scale_only_prior=not placed or posterior_scale > ONLY_PRIOR_RATIO * left_scale,
         sigma_scale=posterior_scale,

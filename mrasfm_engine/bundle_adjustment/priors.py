@@ -20,6 +20,7 @@ from mrasfm_engine.types import Bools, Floats, Ints
 # How firmly a gauge is held, relative to the priors: firm enough to hold, soft enough not to hurt the conditioning.
 GAUGE_STIFFNESS = 1e6
 HELD_SHARE = 0.02  # of a prior's sigma that is left in a direction that is held
+CONTRADICTED_SIGMAS = 5.0  # of the prior: a camera farther off than that was not given as well as was declared
 GAUGE_USUAL = 3.0  # cameras farther off than this many usual distances hardly count in the gauge, nearer ones alike
 
 
@@ -75,6 +76,16 @@ class CalibrationPrior:
         """Weights (c,) of the loss on each camera's place: 1 for one as given, near 0 for one far from there."""
         result: Floats = _loss_weights(self._whitened(state)[0], self.loss_scale)[:, 3]
         return result
+
+    def sigmas_left(self, state: State) -> Floats:
+        """Standard deviations (c, 6), rad and m, that the prior has left of rotations, then places.
+
+        Those that were declared, but larger of a rotation or place that is more than `CONTRADICTED_SIGMAS` from what
+        was given: as the loss leaves them.
+        """
+        whitened, sigma = self._whitened(state)
+        is_contradicted = np.repeat(_squared(whitened) > CONTRADICTED_SIGMAS**2, 3, axis=1)
+        return np.where(is_contradicted, sigma / np.sqrt(_loss_weights(whitened, self.loss_scale)), sigma)
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
         sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)

@@ -251,14 +251,17 @@ def observed_directions(
     if mapper.drive.has_single_camera or certainty is None or certainty.calibration.shape != (6 * cameras, 6 * cameras):
         return None
     prior = calibration_prior(mapper)
-    return assess_directions(
+    found = assess_directions(
         certainty.calibration if covariance is None else covariance,
         position_m=mapper.state.camera_position_m,
         sigma_rotation_rad=prior.sigma_rotation_rad,
         sigma_translation_m=prior.sigma_translation_m,
         placed=placed,
         weight=prior.weights_of_places(mapper.state),
+        sigma_left=prior.sigmas_left(mapper.state),
     )
+    # Of a camera that observes nothing, what the others share is all that a drive knows.
+    return replace(found, observed=found.observed & observing_cameras(mapper)[:, None])
 
 
 def take_calibration(mapper: Mapper, other: Mapper) -> None:

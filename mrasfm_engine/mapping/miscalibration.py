@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
+from mrasfm_engine.bundle_adjustment.priors import CONTRADICTED_SIGMAS, CalibrationPrior
 from mrasfm_engine.mapping.systematic_errors import SystematicErrors
 from mrasfm_engine.mapping.unit_registration import Registration
 from mrasfm_engine.scene.state import State
@@ -17,7 +17,6 @@ from mrasfm_engine.types import Floats
 from schemas.findings import Finding, warning
 
 SIGNIFICANT_SIGMAS = 5.0  # of the posterior: less is no correction at all
-BEYOND_PRIOR_SIGMAS = 5.0  # of the prior and of what all images share: what was declared cannot be true
 UNUSUAL = 5.0  # times the other cameras' median correction, where that is more than
 MIN_UNUSUAL_DEG, MIN_UNUSUAL_M = 1.0, 0.1  # what mountings and calibrations are off by as a rule
 MIN_OTHERS = 2  # cameras that say what is usual
@@ -122,7 +121,7 @@ def _sigmas(
     """
     sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
     # The common scale may be off: it moves all cameras, and is no fault of one.
-    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * sigma, 1e-9)
+    posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * directions.prior_sigma, 1e-9)
     allowed = sigma if systematic is None else np.hypot(sigma, systematic.sigma_camera(posterior))
     return sigma, allowed, posterior
 
@@ -130,7 +129,7 @@ def _sigmas(
 def _is_wrong(corrections: Floats, camera: int, *, sigma: Floats, posterior: Floats, floor: float) -> bool:
     own = corrections[camera]
     certain = np.abs(own) >= SIGNIFICANT_SIGMAS * posterior  # a direction that is hardly known makes no other one large
-    if (np.abs(own) > BEYOND_PRIOR_SIGMAS * sigma)[certain].any():
+    if (np.abs(own) > CONTRADICTED_SIGMAS * sigma)[certain].any():
         return True
     others = np.linalg.norm(np.delete(corrections, camera, axis=0), axis=1)
     usual = max(floor, UNUSUAL * float(np.median(others))) if len(others) >= MIN_OTHERS else np.inf

@@ -37,13 +37,14 @@ def axis(camera: int, direction: int) -> np.ndarray:
     return result.ravel()
 
 
-def judge(covariance: np.ndarray, cameras: int = 4, *, placed: bool = True):  # type: ignore[no-untyped-def]
+def judge(covariance: np.ndarray, cameras: int = 4, *, placed: bool = True, left: np.ndarray | None = None):  # type: ignore[no-untyped-def]
     return assess_directions(
         covariance,
         position_m=PLACES[:cameras],
         sigma_rotation_rad=SIGMA_RAD[:cameras],
         sigma_translation_m=SIGMA_M[:cameras],
         placed=placed,
+        sigma_left=left,
     )
 
 
@@ -132,6 +133,17 @@ def test_baselines_that_their_prior_let_go_of_are_not_as_long_as_given() -> None
 
     assert only_prior(1.0)
     assert not only_prior(1e-3)
+
+
+@pytest.mark.parametrize(("times", "observed"), [(1.0, False), (10.0, True)])
+def test_what_the_loss_has_let_go_is_not_what_the_prior_says(times: float, observed: bool) -> None:
+    """One camera's place as uncertain as declared: observed, where the loss has left ten times that."""
+    left = np.tile([*[SIGMA_RAD[0]] * 3, *[SIGMA_M[0]] * 3], (4, 1))
+    left[1] *= times
+    found = judge(posterior(everything_but(growth(PLACES), axis(1, 5))), left=left)
+    assert found.observed[1, 5] == observed
+    assert found.to_hold[1, 5] == (not observed)
+    np.testing.assert_array_equal(found.prior_sigma, left)
 
 
 def test_what_nothing_determines_is_not_observed() -> None:

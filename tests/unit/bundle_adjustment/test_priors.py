@@ -326,6 +326,11 @@ def test_a_camera_that_is_turned_keeps_its_place() -> None:
     moved_m[2, 0] += 30.0 * term.sigma_translation_m[2]
     state = replace(truth, camera_rotation=turned, camera_position_m=moved_m)
     np.testing.assert_allclose(term.weights_of_places(state)[[1, 2]], [1.0, 0.01], atol=1e-3)
+    # Of the prior ten times the sigma is left of what is thirty sigmas off, and of all else what was declared.
+    declared = np.repeat(np.stack([term.sigma_rotation_rad, term.sigma_translation_m], 1), 3, axis=1)
+    expected = np.ones((len(declared), 6))
+    expected[1, :3] = expected[2, 3:] = 10.0
+    np.testing.assert_allclose(term.sigmas_left(state) / declared, expected, rtol=0.01)
     # A step of the turned camera costs what it costs one that is as given.
     step_m = np.zeros_like(moved_m)
     step_m[[0, 1], 0] = np.array([-1.0, 1.0]) * term.sigma_translation_m[:2]  # the mean is held

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
+from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.calibration import calibration_prior
+from mrasfm_engine.mapping.calibration import calibration_prior, observed_directions
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, adjust_globally
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import (
@@ -27,6 +28,7 @@ from tests.helpers.simulated_drive import (
     make_model,
     make_simulated_drive,
     true_matches,
+    with_cameras,
     with_true_poses,
 )
 
@@ -56,6 +58,11 @@ def refined(simulated: SimulatedDrive) -> tuple[Mapper, Refinement]:
     return mapper, refine(mapper)
 
 
+def declared(prior: CalibrationPrior) -> np.ndarray:
+    """Standard deviations (c, 6) of the cameras' rotations and places, as a manifest declares them."""
+    return np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+
+
 def drive(given, *, straight: bool = False, points: int = 900) -> SimulatedDrive:  # type: ignore[no-untyped-def]
     units = STRAIGHT if straight else TURNING
     return make_simulated_drive(units=units, points=points, straight=straight, given=given)
@@ -83,6 +90,23 @@ def test_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
     if straight:
         np.testing.assert_array_equal(result.recalibrated, np.arange(6) == 2)
         np.testing.assert_array_equal(mapper.state.camera_rotation[0], simulated.drive.rig_from_cam[0, :3, :3])
+
+
+def test_a_camera_far_from_where_it_is_declared_to_a_millimetre_is_named_and_moved() -> None:
+    """The drive knows its place less well than the declaration, which the adjustment has let go."""
+
+    def moved(rig_from_cam: np.ndarray) -> np.ndarray:
+        rig_from_cam[3, :3, 3] += [0.0, 0.3, 0.0]
+        return rig_from_cam
+
+    simulated = drive(moved)
+    certain = {"sigma_translation_m": 0.001, "sigma_rotation_deg": 0.2}
+    cameras = [camera.model_copy(update=certain) for camera in simulated.drive.manifest.rig.cameras]
+    mapper, result = refined(with_cameras(simulated, cameras))
+    assert [wrong.camera for wrong in result.miscalibrations] == [3]
+    assert 0.25 < result.miscalibrations[0].translation_m < 0.35
+    off_m = mapper.state.camera_position_m[3] - simulated.truth.rig_from_cam[3, :3, 3]
+    assert np.linalg.norm(off_m) < 0.05
 
 
 @pytest.mark.parametrize("straight", [False, True])
@@ -131,6 +155,7 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
     directions = Observability(
         observed=sees_rotations,
         ratio=np.where(sees_rotations, 0.01, np.nan),
+        prior_sigma=declared(prior),
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
@@ -167,6 +192,7 @@ def test_what_lens_models_turn_a_camera_by_is_no_miscalibration(lenses_deg: floa
     directions = Observability(
         observed=np.ones((4, 6), dtype=np.bool_),
         ratio=np.full((4, 6), 0.1),
+        prior_sigma=declared(prior),
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
@@ -189,12 +215,22 @@ def test_a_direction_that_is_hardly_known_makes_no_camera_wrong(about_y_deg: flo
     directions = Observability(
         observed=np.ones((4, 6), dtype=np.bool_),
         ratio=ratio,
+        prior_sigma=declared(prior),
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
         prior_sigma_scale=0.01,
     )
     assert [one.camera for one in find_miscalibrations(prior, state, directions)] == wrong
+
+
+def test_of_a_camera_that_observes_nothing_no_direction_is_observed() -> None:
+    simulated = make_simulated_drive(units=8, cameras=3, points=300, hidden=lambda unit, camera: camera == 1)
+    mapper, result = refined(simulated)
+    known = observed_directions(mapper, result.certainty, 1e-12 * np.eye(18), placed=True)
+    assert known is not None
+    np.testing.assert_array_equal(known.observed.all(axis=1), [True, False, True])
+    assert not known.observed[1].any()
 
 
 def test_what_the_drive_does_not_observe_of_a_wrong_camera_stays_as_given() -> None:
