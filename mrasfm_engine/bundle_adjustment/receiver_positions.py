@@ -59,6 +59,13 @@ class ReceiverPositions:
     segment: Ints | None = None  # (n,) numbers of the parts between which the error jumps; None for one
     loss_scale: float = 3.0
 
+    def bounded(self, largest_m: float) -> tuple[ReceiverPositions, Floats]:
+        """The term with standard deviations of at most so much, and the common error (3,) that is left out of them."""
+        sigma_m, wander_m = np.minimum(self.sigma_m, largest_m), np.minimum(self.wander_m, largest_m)
+        left_out_m2 = (self.sigma_m**2 - sigma_m**2) + (self.wander_m**2 - wander_m**2)
+        result: Floats = np.sqrt(np.median(left_out_m2, axis=0))
+        return replace(self, sigma_m=sigma_m, wander_m=wander_m), result
+
     @staticmethod
     def from_samples(
         *,

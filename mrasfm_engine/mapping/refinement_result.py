@@ -14,6 +14,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
+from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.calibration import CalibrationDecision, calibration_prior, of_cameras_alone
@@ -32,9 +33,13 @@ from mrasfm_engine.mapping.time_offsets import (
     times_may_vary,
     undeclared_readouts,
 )
-from mrasfm_engine.types import Bools
+from mrasfm_engine.types import Bools, Floats
 from schemas.findings import Finding
 
+# Of a position, in the inverse that says how certain everything is. Heights that nobody knows are declared to a
+# kilometre; beside images, which know units among one another to a tenth of a millimetre, the square of that is lost in
+# rounding, and with it what all else is known to. An error that all positions share changes nothing else.
+LARGEST_SIGMA_M = 30.0
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
 ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
@@ -165,8 +170,22 @@ def certainty_of(mapper: Mapper, result: Refinement) -> Covariances | None:
     problem = problem_of_all_unknowns(mapper, result)
     if problem is None:
         return None
+    problem, left_out_m = _with_bounded_positions(problem)
     certainty = of_cameras_alone(mapper, covariances(problem, problem.state))
+    certainty = replace(certainty, sigma_unit_position_m=np.hypot(certainty.sigma_unit_position_m, left_out_m))
     return _with_errors_of_given_scale(mapper, result, certainty)
+
+
+def _with_bounded_positions(problem: Problem) -> tuple[Problem, Floats]:
+    """The problem with no position less known than `LARGEST_SIGMA_M`, and the common error (3,) that leaves out."""
+    left_out_m, terms = np.zeros(3), list[Term]()
+    for term in problem.terms:
+        if isinstance(term, ReceiverPositions):
+            bounded, left_out_m = term.bounded(LARGEST_SIGMA_M)
+            terms.append(bounded)
+        else:
+            terms.append(term)
+    return replace(problem, terms=terms), left_out_m
 
 
 def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | None:

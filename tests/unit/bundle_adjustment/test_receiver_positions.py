@@ -79,6 +79,20 @@ def test_without_outliers_it_costs_what_correlated_errors_do() -> None:
     assert term.cost(state) < 0.3 * replace(term, wander_m=0 * term.wander_m).cost(state)
 
 
+def test_bounded_sigmas_leave_out_what_is_beyond_and_nothing_else() -> None:
+    rng = np.random.default_rng(0)
+    term = received(moving(rng), rng)
+    same, left_out_m = term.bounded(2.0)
+    np.testing.assert_array_equal(same.sigma_m, term.sigma_m)
+    np.testing.assert_array_equal(same.wander_m, term.wander_m)
+    np.testing.assert_array_equal(left_out_m, np.zeros(3))
+    heights = np.array([1.0, 1.0, 1e4])
+    bounded, left_out_m = replace(term, sigma_m=term.sigma_m * heights).bounded(2.0)
+    np.testing.assert_array_equal(bounded.sigma_m[:, :2], term.sigma_m[:, :2])
+    np.testing.assert_array_equal(bounded.sigma_m[:, 2], np.full(UNITS, 2.0))
+    np.testing.assert_allclose(left_out_m, [0.0, 0.0, 1e4 * np.median(term.sigma_m[:, 2])], rtol=0.05)
+
+
 def test_errors_before_and_after_a_jump_are_independent() -> None:
     rng = np.random.default_rng(0)
     state = moving(rng)

@@ -77,6 +77,24 @@ def refined(
     return Refined(mapper, result, simulated)
 
 
+def test_heights_that_nobody_knows_leave_all_else_known() -> None:
+    """A receiver without heights, all of which are zero with a sigma of ten kilometres."""
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=2000)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    mapper.complete()
+    track = received(simulated, 0.1)
+    level = track.position_m * [1.0, 1.0, 0.0] + [0.0, 0.0, 1500.0]
+    sigma_m = np.tile([0.1, 0.1, 1e4], (UNITS, 1))
+    gnss = replace(track, position_m=level, sigma_m=sigma_m)
+    result = refine(mapper, AbsolutePriors(gnss=gnss, antenna_in_rig_m=ARM_M))
+    assert result.georeferenced
+    assert result.certainty is not None
+    assert 0.0 < result.certainty.sigma_scale < 0.02
+    sigma_m = result.certainty.sigma_unit_position_m
+    assert 0.01 < sigma_m[:, :2].min() < sigma_m[:, :2].max() < 1.0
+    assert 3e3 < sigma_m[:, 2].min() < sigma_m[:, 2].max() < 3e4
+
+
 @pytest.mark.parametrize("while_mapping", [True, False])
 @pytest.mark.parametrize("sigma_m", [0.02, *slow(0.3)])
 def test_the_better_the_receiver_the_better_the_scene_however_the_calibration_is_off(
