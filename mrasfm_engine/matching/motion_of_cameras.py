@@ -413,6 +413,7 @@ class _MotionProblem:
 
 
 def _own_motion(rig: UncertainRig, one: MotionMatches, pixel_rad: float, max_error_px: float) -> _OwnMotion | None:
+    """The motion that matches of one camera's images show; None where these are too few."""
     found = relative_pose(one.rays_a, one.rays_b, max_error=max_error_px * pixel_rad)
     if found is None:
         return None
