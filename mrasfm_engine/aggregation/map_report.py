@@ -13,8 +13,9 @@ from mrasfm_engine.aggregation import stages
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import Association
 from mrasfm_engine.aggregation.graph import Chain
-from mrasfm_engine.aggregation.loops import Loop
+from mrasfm_engine.aggregation.loops import GATE_SIGMAS, Loop
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap
+from mrasfm_engine.aggregation.map_placement import Placement
 from mrasfm_engine.aggregation.map_scene import map_scene, params_of
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.seam_pictures import seam_picture, shown_square
@@ -62,6 +63,7 @@ class MapResult:
     chains: Sequence[Chain]  # of components; the first is the map's
     map_from_scene: Floats  # (scenes, 4, 4) before units varied on their own
     chained: Floats  # the same, one scene after the other
+    placements: Sequence[Placement]  # of components that seams connect
     joint_reports: Sequence[Report]
     assembly: Assembly
     adjusted: AdjustedMap
@@ -108,6 +110,9 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
                 "Make several maps of fewer drives if their scenes' calibrations are uncertain.",
             )
         )
+    for placement in result.placements:
+        if placement.sigmas > GATE_SIGMAS:
+            run.found(_positions_contradict(placement, [scene.name for scene in result.scenes]))
     for k, factor in result.adjusted.lengthened.items():
         run.found(_lengthened(result.scenes[k], factor))
     names = result.unconnected
@@ -143,6 +148,19 @@ def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Fin
         why = "no two of them see the same"
         remedy = "Give drives whose trajectories meet, in similar light, or check their positions."
     return warning("nothing-connected", f"all scenes are placed by positions only: {why}", remedy)
+
+
+def _positions_contradict(placement: Placement, names: Sequence[str]) -> Finding:
+    """Finding on scenes whose positions differ by more than their sigmas let expect; the worst of them."""
+    worst = sorted(placement.off_m, key=lambda k: -placement.off_m[k])[:MAX_FINDINGS]
+    off = ", ".join(f"{names[k]} {placement.off_m[k]:.2f} m" for k in worst)
+    return warning(
+        "positions-contradict",
+        f"positions of scenes that seams connect differ by more than their sigmas, by {placement.sigmas:.1f} of these: "
+        f"the map lies between them, off those of {off}",
+        "Check antennas, height datums and clocks of these drives, and declare sigmas that hold a receiver's constant "
+        "error.",
+    )
 
 
 def _lengthened(scene: SourceScene, factor: float) -> Finding:

@@ -1,14 +1,12 @@
 """Multi-scene adjustment: one adjustment of the transforms of all scenes of a component, over joined points.
 
 Points that seams join become tracks over any number of scenes. All scenes but one vary rigidly, over all tracks at
-once, so that no seam is favoured by its order. GNSS then places the result: every drive's receiver has a constant
-offset of its own, so only the shapes of the trajectories determine the rotation, and the translation is the mean of
-what the receivers measured.
+once, so that no seam is favoured by its order. GNSS then places the result (see `map_placement`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,8 +17,6 @@ from mrasfm_engine.aggregation.seam_refinement import OBSERVATIONS_OF_IMAGE, mov
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.config import EngineConfig
-from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.averaging import geometric_median, robust_mean_rotation
 from mrasfm_engine.types import Floats, Ints
 
 MIN_TRACKS = 10
@@ -101,26 +97,3 @@ def adjust_jointly(
     )
     poses = moved_scenes(assembly, first_from_scene, solution)
     return JointResult(first_from_scene=poses, owner=owner, report=report)
-
-
-def placed(first_from_scene: Mapping[int, Floats], map_from_scene: Floats, middle_m: Floats) -> Floats:
-    """The transform (4, 4) map_from_first that puts a component where its drives' positions say.
-
-    Parameters
-    ----------
-    first_from_scene
-        Poses of the component's scenes in its own frame.
-    map_from_scene
-        Poses (scenes, 4, 4) of all scenes by positions alone.
-    middle_m
-        Midpoints (scenes, 3) of all scenes in their own frames.
-    """
-    members = sorted(first_from_scene)
-    turns = np.stack([map_from_scene[k][:3, :3] @ first_from_scene[k][:3, :3].T for k in members])
-    rotation = robust_mean_rotation(turns)
-    own = np.stack([se3.apply(first_from_scene[k], middle_m[k][None])[0] for k in members])
-    given = np.stack([se3.apply(map_from_scene[k], middle_m[k][None])[0] for k in members])
-    shifts = given - own @ rotation.T
-    # Of two receivers none is more right than the other; of more, those that agree.
-    shift = shifts.mean(0) if len(shifts) < 3 else geometric_median(shifts)
-    return se3.transform(rotation, shift)

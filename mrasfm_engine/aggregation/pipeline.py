@@ -16,8 +16,9 @@ from mrasfm_engine.aggregation.graph import Chain, SeamGraph
 from mrasfm_engine.aggregation.load import name_scenes
 from mrasfm_engine.aggregation.loops import Loop, ScenePaths, off_positions
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, adjust_map
+from mrasfm_engine.aggregation.map_placement import Placement, ScenePlace, placed
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
-from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
+from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
@@ -177,7 +178,8 @@ def _join_scenes(
     started = time.perf_counter()
     run.begin(Stage.MULTI_SCENE_ADJUSTMENT)
     poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
-    middle = np.stack([scene.midpoint_m for scene in found])
+    places = [ScenePlace.from_scene(scene) for scene in found]
+    placements: list[Placement] = []
     reports = []
     for chain in chains:
         if len(chain.scenes) < 2:
@@ -194,9 +196,10 @@ def _join_scenes(
             cancel=run.cancel,
         )
         own = {k: m for k, m in zip(members, joint.first_from_scene, strict=True) if found[k].is_placed}
-        map_from_first = placed(own, known.map_from_scene, middle)
-        poses[members] = map_from_first @ joint.first_from_scene
-        chained[members] = map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
+        placement = placed(own, known.map_from_scene, places)
+        placements.append(placement)
+        poses[members] = placement.map_from_first @ joint.first_from_scene
+        chained[members] = placement.map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
     run.ended(Stage.MULTI_SCENE_ADJUSTMENT, started, loops=sum(len(chain.closings) for chain in chains))
     vehicles = vehicles_of(found, run.config.bundle_adjustment)
@@ -210,6 +213,7 @@ def _join_scenes(
         chains=chains,
         map_from_scene=poses,
         chained=chained,
+        placements=placements,
         joint_reports=[r for r in reports if r is not None],
         assembly=Assembly(scenes=found),
         adjusted=adjusted,

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner, placed
+from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner
 from mrasfm_engine.aggregation.seam import Seam
-from mrasfm_engine.geometry import se3
 from tests.helpers.small_scenes import (
     CONFIG,
     Driven,
@@ -105,33 +104,3 @@ def test_all_scenes_are_adjusted_at_once(drives: list[Driven], seams: list[Seam]
     without = adjust_jointly(assembly, start, seams, 1, configured(multi_scene_adjustment=False), cancel=lambda: False)
     assert without.report is None
     np.testing.assert_array_equal(without.first_from_scene, start)
-
-
-@pytest.mark.parametrize("count", [2, 3])
-def test_the_whole_is_put_in_the_middle_of_what_receivers_say(drives: list[Driven], count: int) -> None:
-    """How the scenes lie to one another is known; only what all receivers have in common remains in the place."""
-    rng = np.random.default_rng(1)
-    some = drives[:count]
-    believed = np.stack([se3.transform(np.eye(3), BIAS_M[k]) @ d.street_from_scene for k, d in enumerate(some)])
-    # The component's own frame is anywhere.
-    first_from_street = se3.transform(se3.exp_so3([0.02, -0.01, 0.7]), rng.normal(size=3) * 40)
-    own = {k: first_from_street @ d.street_from_scene for k, d in enumerate(some)}
-    middle = np.stack([d.source.midpoint_m for d in some])
-    street_from_first = placed(own, believed, middle)
-    for k, driven in enumerate(some):
-        shift = se3.apply(street_from_first @ own[k], middle[k][None])[0]
-        shift -= se3.apply(driven.street_from_scene, middle[k][None])[0]
-        if count == 2:
-            assert 0 < np.abs(shift - BIAS_M[:2].mean(0)).max() < 1e-3
-        else:  # the point with the smallest sum of distances to all
-            directions = (BIAS_M - shift) / np.linalg.norm(BIAS_M - shift, axis=1)[:, None]
-            assert 0 < np.linalg.norm(directions.sum(0)) < 0.05
-    assert 0 <= se3.rotation_angle_deg((street_from_first @ first_from_street)[:3, :3]) < 1e-3
-
-
-def test_one_receiver_that_is_far_off_moves_little(drives: list[Driven]) -> None:
-    bias = np.array([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [8.0, -6.0, 3.0]])
-    believed = np.stack([se3.transform(np.eye(3), b) @ d.street_from_scene for b, d in zip(bias, drives, strict=True)])
-    middle = np.stack([d.source.midpoint_m for d in drives])
-    street = placed({k: d.street_from_scene for k, d in enumerate(drives)}, believed, middle)
-    assert 0 < np.linalg.norm(street[:3, 3]) < 0.3

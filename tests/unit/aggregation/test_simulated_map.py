@@ -89,8 +89,8 @@ def test_a_scene_that_overlaps_nothing_is_placed_by_its_receiver_and_marked(
     verdicts = {scene["name"]: scene["verdict"] for scene in document["scenes"]}
     assert verdicts == {**dict.fromkeys("abc", "connected"), "far": "placed by positions"}
     findings = json.loads((out / "report.json").read_text())["findings"]
-    assert [finding["code"] for finding in findings] == ["unconnected"]
-    assert "far" in findings[0]["what"]
+    assert [finding["code"] for finding in findings] == ["positions-contradict", "unconnected"]  # sigmas are 1 cm
+    assert "far" in findings[1]["what"]
     found = street_from_map(result, "far", drives) @ poses.trajectories["far"].world_from_rig
     registered = np.arange(UNITS) != 2
     error = found[:, :3, 3] - drives["far"].street_from_rig[registered, :3, 3]
