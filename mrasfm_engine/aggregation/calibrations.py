@@ -9,19 +9,20 @@ what they let it expect is the prior (see `vehicles`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.vehicles import Expected, Vehicle, corrected
+from mrasfm_engine.aggregation.association import component_labels
+from mrasfm_engine.aggregation.vehicles import LEARNING_SHARE, Expected, Vehicle, corrected
 from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, IntrinsicsPrior
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.types import Bools, Floats
+from mrasfm_engine.types import Bools, Floats, Ints
 
 NOTHING_EXPECTED: Mapping[int, Expected] = MappingProxyType({})
 MAX_COUPLINGS = 500_000  # of cameras that vary with units and with one another: the solver holds some 400 bytes of each
@@ -33,6 +34,8 @@ def calibration_priors(
     free_units: Bools,
     config: BundleAdjustmentConfig,
     expected: Mapping[int, Expected] = NOTHING_EXPECTED,
+    *,
+    told_lengths: Collection[int] = (),
 ) -> list[CameraPosePrior]:
     """Make one prior for each drive whose calibration may vary, from the uncertainty that its scenes state.
 
@@ -49,8 +52,10 @@ def calibration_priors(
         Units (u,) that vary.
     expected
         What other drives of its vehicle let a scene's cameras expect, by scene.
+    told_lengths
+        Scenes whose length others know better (see `scenes_of_told_length`).
     """
-    priors = _all_priors(assembly, free_units, config, expected)
+    priors = _all_priors(assembly, free_units, config, expected, told_lengths)
     return [] if _too_many(priors, free_units) else priors
 
 
@@ -60,8 +65,36 @@ def _too_many(priors: Sequence[CameraPosePrior], free_units: Bools) -> bool:
     return refined * (int(free_units.sum()) + refined) > MAX_COUPLINGS
 
 
+def scenes_of_told_length(assembly: Assembly, owner: Ints) -> frozenset[int]:
+    """Scenes whose length others tell: those that joined points connect with them and that know their own much better.
+
+    All have positions. Baselines that a scene has not observed, held where they are, would make the others as long.
+
+    Parameters
+    ----------
+    owner
+        The joined point (p,) of the assembly's points, -1 for points of one scene alone.
+    """
+    count, joined = len(assembly.scenes), np.flatnonzero(owner >= 0)
+    pairs = np.unique(np.column_stack([assembly.scene_of_point[joined], count + owner[joined]]), axis=0)
+    label = component_labels(count + int(owner.max(initial=-1)) + 1, pairs.tolist())
+    best: dict[int, float] = {}
+    for k, scene in enumerate(assembly.scenes):
+        if scene.is_placed and scene.sigma_scale is not None:
+            best[label[k]] = min(best.get(label[k], np.inf), scene.sigma_scale)
+    return frozenset(
+        k
+        for k, scene in enumerate(assembly.scenes)
+        if scene.is_placed and scene.sigma_scale is not None and best[label[k]] < LEARNING_SHARE * scene.sigma_scale
+    )
+
+
 def _all_priors(
-    assembly: Assembly, free_units: Bools, config: BundleAdjustmentConfig, expected: Mapping[int, Expected]
+    assembly: Assembly,
+    free_units: Bools,
+    config: BundleAdjustmentConfig,
+    expected: Mapping[int, Expected],
+    told_lengths: Collection[int],
 ) -> list[CameraPosePrior]:
     """Priors as `calibration_priors` makes them, however many they are."""
     if not config.refine_calibration:
@@ -85,7 +118,7 @@ def _all_priors(
         known = np.where(observed, np.minimum(sigma / np.sqrt(left), given), given)
         number = np.arange(assembly.first_camera[k], assembly.first_camera[k + 1])
         poses, held = scene.drive.rig_from_cam, ~observed
-        if not scene.is_placed:
+        if not scene.is_placed or k in told_lengths:
             held[:, 3:] = False  # other scenes tell its length, and thereby its baselines'
         if told is not None:
             poses, known, held = _with_expected(poses, known, held, told, left)
@@ -196,18 +229,27 @@ def _with_free_places(term: CameraPosePrior | IntrinsicsPrior) -> CameraPosePrio
 
 
 def map_calibrations(
-    assembly: Assembly, state: State, free_units: Bools, vehicles: Sequence[Vehicle], config: BundleAdjustmentConfig
+    assembly: Assembly,
+    state: State,
+    free_units: Bools,
+    vehicles: Sequence[Vehicle],
+    config: BundleAdjustmentConfig,
+    *,
+    told_lengths: Collection[int] = (),
 ) -> MapCalibrations:
-    """Calibrations that vary with units (u,) of a map, by what drives know themselves and of their vehicles."""
+    """Calibrations that vary with units (u,) of a map, by what drives know themselves and of their vehicles.
+
+    Scenes of `told_lengths` let all directions of their cameras' places vary within their priors.
+    """
     expected = {k: told for vehicle in vehicles for k, told in vehicle.expected.items()}
     learning = tuple(k for k, told in expected.items() if told.learns)
     more = free_units | (assembly.registered & np.isin(assembly.scene_of_unit, learning))
-    priors = _all_priors(assembly, more, config, expected)
+    priors = _all_priors(assembly, more, config, expected, told_lengths)
     too_many = _too_many(priors, more)
     cameras = np.zeros(len(assembly.camera_kind), dtype=np.bool_)
     intrinsics = np.zeros((len(cameras), INTRINSICS), dtype=np.bool_)
     if too_many or not priors:
-        more, priors = free_units, calibration_priors(assembly, state, free_units, config)
+        more, priors = free_units, calibration_priors(assembly, state, free_units, config, told_lengths=told_lengths)
         expected, learning = {}, ()
     for prior in priors:
         cameras[prior.camera] = True

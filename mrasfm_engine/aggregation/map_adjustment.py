@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from mrasfm_engine.aggregation.assembly import Assembly
-from mrasfm_engine.aggregation.calibrations import MapCalibrations, map_calibrations
+from mrasfm_engine.aggregation.calibrations import MapCalibrations, map_calibrations, scenes_of_told_length
 from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
 from mrasfm_engine.aggregation.vehicles import Vehicle
@@ -107,7 +107,14 @@ def adjust_map(
     free = _free_units(assembly, problem, joined, config)
     if config.aggregation.final_adjustment == "none":
         vehicles = ()
-    calibrations = map_calibrations(assembly, state, free, vehicles, config.bundle_adjustment)
+    calibrations = map_calibrations(
+        assembly,
+        state,
+        free,
+        vehicles,
+        config.bundle_adjustment,
+        told_lengths=scenes_of_told_length(assembly, owner),
+    )
     free, cameras = calibrations.free_units, calibrations.cameras
     problem = _with_cameras(problem, calibrations.at_priors(state))
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from mrasfm_engine.aggregation import calibrations, map_adjustment
 from mrasfm_engine.aggregation.assembly import Assembly
 from mrasfm_engine.aggregation.association import coarse_transform
-from mrasfm_engine.aggregation.calibrations import calibration_priors, map_calibrations
+from mrasfm_engine.aggregation.calibrations import calibration_priors, map_calibrations, scenes_of_told_length
 from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, MapModel, adjust_map, all_points
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.vehicles import vehicles_of
@@ -488,6 +488,45 @@ def test_baselines_of_a_scene_without_positions_follow_the_other_scenes(street: 
     assert placed.held[:, 3:].all()
     assert not unplaced.held.any()
     np.testing.assert_allclose(unplaced.sigma[:, 3:], CONFIG.bundle_adjustment.sigma_translation_m)
+
+
+def with_sigma_scale(driven: Driven, sigma: float | None) -> Driven:
+    report = driven.source.report | ({} if sigma is None else {"scale": {"sigma_relative": sigma}})
+    return replace(driven, source=replace(driven.source, report=report))
+
+
+def test_a_scene_that_hardly_knows_its_length_takes_it_from_another(street: Street, folder: Path) -> None:
+    """Four units whose baselines were off by 1 % made 26 others longer that knew their length to 0.4 %."""
+    long, rough = np.arange(0.0, 14.0, 1.0), np.arange(3.0, 17.0, 2.0)
+    scales = 1.0, 1.04
+    drives = [
+        drive_along(
+            street, folder / f"told{k}", way, cameras_off_deg=0.05, scale=scales[k], gnss_noise_m=noise_m, seed=k
+        )
+        for k, (way, noise_m) in enumerate(((long, 0.2), (rough, 2.0)))
+    ]
+
+    def length(sigmas: tuple[float | None, float | None]) -> float:
+        known = [with_sigma_scale(driven, sigma) for driven, sigma in zip(drives, sigmas, strict=True)]
+        at = adjusted(known, "all").model.state.unit_position_m[: len(long)]
+        return float(np.linalg.norm(at[-1] - at[0]) / np.linalg.norm(long[-1] - long[0]))
+
+    assert abs(length((0.004, 0.1)) - 1.0) < 0.005
+    assert abs(length((0.004, 0.007)) - 1.0) > 0.008  # which of them is right is not known
+
+
+def test_lengths_are_told_by_connected_scenes_with_positions(two: list[Driven]) -> None:
+    def told(sigmas: tuple[float | None, float | None], *, joined: bool = True, placed: bool = True) -> set[int]:
+        known = [with_sigma_scale(driven, sigma).source for driven, sigma in zip(two, sigmas, strict=True)]
+        assembly = Assembly(scenes=[replace(known[0], is_placed=placed), known[1]])
+        owner = owner_of(two) if joined else np.full(int(assembly.first_point[-1]), -1)
+        return {*scenes_of_told_length(assembly, owner)}
+
+    assert told((0.001, 0.1)) == {1}
+    assert told((0.1, 0.001)) == {0}
+    assert told((0.01, 0.019)) == told((0.01, None)) == told((None, None)) == set()
+    assert told((0.001, 0.1), joined=False) == set()
+    assert told((0.001, 0.1), placed=False) == set()
 
 
 def test_a_far_scene_stays_upright_where_it_is(street: Street, folder: Path, two: list[Driven]) -> None:
