@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from heapq import heapify, heappop, heappush
 
@@ -45,6 +45,11 @@ class SeamGraph:
         Those through every scene, for what loops say; without, scenes have the errors of their images alone.
     off_positions
         Distance of a seam from positions, in sigmas; without, these say nothing.
+
+    Attributes
+    ----------
+    ends
+        The scenes of each seam, a's and b's.
     """
 
     def __init__(
@@ -58,7 +63,7 @@ class SeamGraph:
         self.seams = list(seams)
         self._names = names
         number = {name: k for k, name in enumerate(names)}
-        self._ends = [(number[s.a], number[s.b]) for s in seams]
+        self.ends = [(number[s.a], number[s.b]) for s in seams]
         self._paths = [ScenePaths()] * len(names) if paths is None else paths
         self._off_positions = off_positions
         self._of_scene = self._seams_of_scenes()
@@ -66,7 +71,7 @@ class SeamGraph:
     def components(self) -> list[tuple[int, ...]]:
         """Scenes that accepted seams connect, the largest first, each with its members ascending."""
         groups: dict[int, list[int]] = {}
-        for scene, value in enumerate(component_labels(len(self._paths), (self._ends[k] for k in self._accepted()))):
+        for scene, value in enumerate(component_labels(len(self._paths), (self.ends[k] for k in self._accepted()))):
             groups.setdefault(value, []).append(scene)
         return sorted((tuple(g) for g in groups.values()), key=lambda g: (-len(g), g))
 
@@ -75,11 +80,11 @@ class SeamGraph:
         poses = {start: np.eye(4)}
         order, used = [start], []
         parent: dict[int, int] = {}
-        reached = [(self._weakness(k), k) for k in self._of_scene[start]]
+        reached = [(self.weakness(k), k) for k in self._of_scene[start]]
         heapify(reached)
         while reached:
             _, k = heappop(reached)
-            a, b = self._ends[k]
+            a, b = self.ends[k]
             if a in poses and b in poses:
                 continue
             known, new = (a, b) if a in poses else (b, a)
@@ -88,7 +93,7 @@ class SeamGraph:
             order.append(new)
             used.append(k)
             for other in self._of_scene[new]:
-                heappush(reached, (self._weakness(other), other))
+                heappush(reached, (self.weakness(other), other))
         others = sorted({k for scene in order for k in self._of_scene[scene]}.difference(used))
         closings = tuple(self._closing(k, poses, parent) for k in others)
         return Chain(scenes=tuple(order), seams=tuple(used), first_from_scene=poses, closings=closings)
@@ -96,17 +101,20 @@ class SeamGraph:
     def without_contradictions(self) -> tuple[SeamGraph, tuple[Loop, ...]]:
         """The graph without seams that loops contradict or leave open, and the loops that do not close."""
         assessment = self.consistency().assess()
+        return self.without(assessment.refused), assessment.loops
+
+    def without(self, refused: Mapping[int, str]) -> SeamGraph:
+        """The graph without some seams, that are not accepted for reasons."""
         seams = [
-            replace(seam, accepted=False, reason=assessment.refused[k]) if k in assessment.refused else seam
+            replace(seam, accepted=False, reason=refused[k]) if k in refused else seam
             for k, seam in enumerate(self.seams)
         ]
-        graph = SeamGraph(self._names, seams, paths=self._paths, off_positions=self._off_positions)
-        return graph, assessment.loops
+        return SeamGraph(self._names, seams, paths=self._paths, off_positions=self._off_positions)
 
     def consistency(self) -> LoopConsistency:
         """The loops of the graph's seams, not assessed yet."""
         return LoopConsistency(
-            self.seams, self._ends, of_scene=self._of_scene, paths=self._paths, off_positions=self._off_positions
+            self.seams, self.ends, of_scene=self._of_scene, paths=self._paths, off_positions=self._off_positions
         )
 
     def balanced(self, chain: Chain) -> dict[int, Floats]:
@@ -116,7 +124,7 @@ class SeamGraph:
         members = list(chain.scenes)
         row = {scene: k for k, scene in enumerate(members)}
         used = [*chain.seams, *(c.seam for c in chain.closings)]
-        units = np.array([[row[e] for e in self._ends[k]] for k in used], dtype=np.int64)
+        units = np.array([[row[e] for e in self.ends[k]] for k in used], dtype=np.int64)
         # The first edge's first unit stays: let it be the chain's first scene.
         flip = units[:, 1] == 0
         measured = np.stack([self.seams[k].a_from_b for k in used])
@@ -139,14 +147,15 @@ class SeamGraph:
     def _seams_of_scenes(self) -> list[list[int]]:
         result: list[list[int]] = [[] for _ in self._paths]
         for k in self._accepted():
-            for end in self._ends[k]:
+            for end in self.ends[k]:
                 result[end].append(k)
         return result
 
     def _accepted(self) -> list[int]:
         return [k for k, seam in enumerate(self.seams) if seam.accepted]
 
-    def _weakness(self, k: int) -> tuple[int, int]:
+    def weakness(self, k: int) -> tuple[int, int]:
+        """Order of seams: the strongest have the least."""
         quality = self.seams[k].quality
         return -min(quality["units_a"], quality["units_b"]), -quality["inliers"]
 
@@ -156,7 +165,7 @@ class SeamGraph:
         return rotation, translation
 
     def _closing(self, k: int, poses: dict[int, Floats], parent: dict[int, int]) -> Closing:
-        a, b = self._ends[k]
+        a, b = self.ends[k]
         by_others = se3.inverse(poses[a]) @ poses[b]
         seam = self.seams[k]
         at = seam.place_b_m[None]

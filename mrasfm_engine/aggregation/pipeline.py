@@ -19,6 +19,7 @@ from mrasfm_engine.aggregation.map_adjustment import AdjustedMap, adjust_map
 from mrasfm_engine.aggregation.map_placement import Placement, ScenePlace, placed
 from mrasfm_engine.aggregation.map_report import MapResult, map_content, map_pictures, say_findings
 from mrasfm_engine.aggregation.multi_scene_adjustment import adjust_jointly, joined_owner
+from mrasfm_engine.aggregation.position_conflicts import contradicted_by_positions
 from mrasfm_engine.aggregation.positions import drive_positions
 from mrasfm_engine.aggregation.seam import Seam
 from mrasfm_engine.aggregation.source import SourceScene
@@ -145,6 +146,7 @@ def _graph(
         paths=[ScenePaths.from_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
         off_positions=lambda k: _off_positions(seams[k], by_name[seams[k].a], by_name[seams[k].b]),
     ).without_contradictions()
+    graph = graph.without(contradicted_by_positions(graph, found, config.aggregation))
     done: set[int] = set()
     chains: list[Chain] = []
     components = graph.components()
