@@ -241,7 +241,9 @@ def map_document(folder: Path) -> dict[str, Any]:
         document = json.loads((folder / MAP_FILE).read_text(encoding="utf-8"))
         if document["version"] != 1:
             raise _of_another_version(folder, f"{MAP_FILE} is of version {document['version']!r}, not of 1")
-        names = [scene["name"] for scene in document["scenes"]]
+        names = [scene["name"] for scene in document["scenes"] if scene["fingerprint"]]
+        if not all(isinstance(seam[end], str) for seam in document["seams"] if seam["accepted"] for end in "ab"):
+            raise TypeError("a seam names no scenes")
         if len(set(names)) != len(names):
             raise ValueError("a scene is in it twice")
         return dict(document)

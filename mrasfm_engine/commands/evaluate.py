@@ -53,10 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             show(table)
         return 0
+    scene = read_poses(arguments.scene)
     if len(arguments.truth) != 1:
         raise InputError(f"--truth has {len(arguments.truth)} files", remedy="A scene has one: give one FILE.")
     file = Path(arguments.truth[0])
-    scene, truth = read_poses(arguments.scene), read_tum(file)
+    truth = read_tum(file)
     kept, matched = match_timestamps(scene.trajectory.timestamps_us, truth.timestamps_us, tolerance_us=TOLERANCE_US)
     if len(kept) < MIN_POSES:
         raise InputError(

@@ -61,9 +61,9 @@ def read_map(folder: Path) -> MapPoses:
         units = [unit for unit in poses["units"] if unit["registered"]]
         return MapPoses(
             trajectories={name: _trajectory([u for u in units if u["scene"] == name]) for name in names},
-            map_from_scene={scene["name"]: np.array(scene["map_from_scene"]) for scene in document["scenes"]},
+            map_from_scene={scene["name"]: _transform(scene["map_from_scene"]) for scene in document["scenes"]},
             seams=[
-                MapSeam(a=seam["a"], b=seam["b"], coarse_a_from_b=np.array(seam["coarse_a_from_b"]))
+                MapSeam(a=seam["a"], b=seam["b"], coarse_a_from_b=_transform(seam["coarse_a_from_b"]))
                 for seam in document["seams"]
                 if seam["accepted"]
             ],
@@ -74,6 +74,13 @@ def read_map(folder: Path) -> MapPoses:
         )
     except (KeyError, TypeError, ValueError, ValidationError) as error:
         raise InputError(f"{folder} is not a map: {error}", remedy=REMEDY) from error
+
+
+def _transform(rows: Any) -> Floats:
+    result = np.array(rows, dtype=np.float64)
+    if result.shape != (4, 4) or not np.isfinite(result).all():
+        raise ValueError(f"a transform in {MAP_FILE} is not one of four rows of four numbers")
+    return result
 
 
 def _trajectory(units: list[dict[str, Any]]) -> Trajectory:

@@ -10,6 +10,7 @@ import pytest
 
 from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
+from mrasfm_engine.aggregation.stages import map_document
 from mrasfm_engine.config import EngineConfig
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.map import REPLACED
@@ -77,7 +78,7 @@ def test_a_map_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
     for folder in (one, two):
         write_scene(make_scene(folder=folder.name), folder, REPORT)
     scene = read_scene(one, "one")
-    document = {"version": 1, "scenes": [{"name": "one", "fingerprint": scene.fingerprint}]}
+    document = {"version": 1, "scenes": [{"name": "one", "fingerprint": scene.fingerprint}], "seams": []}
     into.mkdir()
     (into / "report.json").write_text("{}")
 
@@ -93,3 +94,23 @@ def test_a_map_of_another_version_is_refused_by_name(tmp_path: Path) -> None:
 
     assert "map.json is of version 2, not of 1" in refusal(2, without="points_m").what
     assert re.search("scenes/one.npz: .*points_m", refusal(1, without="points_m").what)
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        {"seams": None},
+        {"seams": [{}]},
+        {"seams": [{"accepted": True, "a": "one"}]},
+        {"seams": [{"accepted": True, "a": "one", "b": 2}]},
+        {"scenes": [{"name": "one"}]},
+        {"scenes": {"one": {}}},
+    ],
+)
+def test_a_map_whose_document_lacks_parts_is_refused(tmp_path: Path, edit: dict[str, object]) -> None:
+    """They are missed after all scenes were read, which ended with a stack trace."""
+    (tmp_path / "report.json").write_text("{}")
+    scenes = [{"name": "one", "fingerprint": "1"}]
+    (tmp_path / "map.json").write_text(json.dumps({"version": 1, "scenes": scenes, "seams": [], **edit}))
+    with pytest.raises(InputError, match="is no map"):
+        map_document(tmp_path)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mrasfm_engine.cli import main
 from mrasfm_engine.commands.evaluate_map import evaluate_map
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
@@ -82,3 +83,22 @@ def test_a_scene_that_the_map_does_not_have(folder: Path) -> None:
     for words in ([f"drive_0={truth}", truth], [f"drive_0={truth}", f"drive_0={truth}"]):
         with pytest.raises(InputError, match="without a scene, or a scene twice"):
             seam_error_m(*words)
+
+
+@pytest.mark.parametrize("rows", [[[1.0]], np.eye(3).tolist(), [[float("nan")] * 4] * 4, None, "a"])
+@pytest.mark.parametrize("part", ["scenes", "seams"])
+def test_a_map_whose_transforms_are_none(folder: Path, part: str, rows: object) -> None:
+    """They are multiplied much later, which ended with a stack trace."""
+    file, truth = folder / "map" / "map.json", truth_of(folder / "truth.tum", 0, 1)
+    document = json.loads(file.read_text())
+    document[part][0]["map_from_scene" if part == "scenes" else "coarse_a_from_b"] = rows
+    file.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="map is not a map"):
+        seam_error_m(truth)
+
+
+def test_a_folder_that_is_not_there_is_named(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It passed for a scene, of which one truth would do."""
+    truth_of(folder / "truth.tum", 0, 1)
+    assert main(["evaluate", "nowhere", "--truth", "drive_0=truth.tum", "drive_1=truth.tum"]) == 2
+    assert "nowhere" in capsys.readouterr().err
