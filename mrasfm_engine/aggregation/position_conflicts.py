@@ -40,6 +40,8 @@ def contradicted_by_positions(
     groups = [_Group(poses={k: np.eye(4)}, placed=[k] if scene.is_placed else []) for k, scene in enumerate(scenes)]
     accepted = [k for k, seam in enumerate(graph.seams) if seam.accepted]
     between = [k for k in accepted if all(scenes[end].is_placed for end in graph.ends[k])]
+    if len(between) == len(accepted):
+        return {}
     for k in between:
         _join(groups, graph, k)
     size = {k: max(len(groups[end].placed) for end in graph.ends[k]) for k in accepted}
@@ -54,15 +56,17 @@ def contradicted_by_positions(
 
 
 def _join(groups: list[_Group], graph: SeamGraph, k: int) -> None:
-    """Join the groups of a seam's ends, where they are two."""
+    """Join the groups of a seam's ends, where they are two: the smaller one moves, so that few scenes do."""
     a, b = (groups[end] for end in graph.ends[k])
     if a is b:
         return
-    a_from_b = _between(a, b, graph, k)
-    a.poses.update({scene: a_from_b @ pose for scene, pose in b.poses.items()})
-    a.placed += b.placed
-    for scene in b.poses:
-        groups[scene] = a
+    larger, smaller, larger_from_smaller = a, b, _between(a, b, graph, k)
+    if len(a.poses) < len(b.poses):
+        larger, smaller, larger_from_smaller = b, a, se3.inverse(larger_from_smaller)
+    larger.poses.update({scene: larger_from_smaller @ pose for scene, pose in smaller.poses.items()})
+    larger.placed += smaller.placed
+    for scene in smaller.poses:
+        groups[scene] = larger
 
 
 def _between(a: _Group, b: _Group, graph: SeamGraph, k: int) -> Floats:
