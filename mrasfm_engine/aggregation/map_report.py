@@ -131,6 +131,7 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Finding:
     """Finding on a map without a seam in use, by the seams that every pair of scenes by itself says."""
     off_m = [seam.quality.get("positions_off_m", 0.0) for seam in found if len(seam.shared) >= settings.min_inliers]
+    above_m = max((seam.quality.get("height_between_m", 0.0) for seam in found), default=0.0)
     if any(seam.accepted for seam in found):
         why, remedy = "no seam is left to use", "See the loops that do not close."
     elif not found:
@@ -144,6 +145,9 @@ def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Fin
         remedy = (
             "Check positions, height datums and clocks, or set aggregation.position_error_m to what they are off by."
         )
+    elif above_m > settings.position_error_m:
+        why = f"positions put scenes that meet above one another, by up to {above_m:.0f} m"
+        remedy = "Compare the height datums of their drives, in gnss.height_datum."
     else:
         why = "no two of them see the same"
         remedy = "Give drives whose trajectories meet, in similar light, or check their positions."
@@ -153,11 +157,11 @@ def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Fin
 def _positions_contradict(placement: Placement, names: Sequence[str]) -> Finding:
     """Finding on scenes whose positions differ by more than their sigmas let expect; the worst of them."""
     worst = sorted(placement.off_m, key=lambda k: -placement.off_m[k])[:MAX_FINDINGS]
-    off = ", ".join(f"{names[k]} {placement.off_m[k]:.2f} m" for k in worst)
+    off = ", ".join(f"{placement.off_m[k]:.2f} m for {names[k]}" for k in worst)
     return warning(
         "positions-contradict",
         f"positions of scenes that seams connect differ by more than their sigmas, by {placement.sigmas:.1f} of these: "
-        f"the map lies between them, off those of {off}",
+        f"from where the map lies by {off}",
         "Check antennas, height datums and clocks of these drives, and declare sigmas that hold a receiver's constant "
         "error.",
     )

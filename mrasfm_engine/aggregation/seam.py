@@ -99,14 +99,15 @@ def find_seam(
         similar_images(a, b, settings, cancel=cancel) if by_positions is None else probes(a, b, by_positions, settings)
     )
     found, tried = _relocalise(a, b, wanted, cross, config, cancel=cancel, progress=progress)
-    if not wanted and by_positions is not None:
-        found = replace(found, reason=_why_no_views(a, b, by_positions, settings))
     quality: dict[str, Any] = {
         "units_tried": found.units_tried,
         "units_agreeing": len(found.units_agreeing),
         "units_elsewhere": found.runner_up,
         "units_looked_for": tried,
     }
+    if not wanted and by_positions is not None:
+        quality["height_between_m"] = abs(height_between_m(a, b, by_positions))
+        found = replace(found, reason=_why_no_views(quality["height_between_m"], settings))
     if found.a_from_b is None:
         quality["pairs_compared"] = cross.compared
         return _unconnected(a, b, by_positions, found.reason, quality)
@@ -118,9 +119,8 @@ def find_seam(
     return _judged(assembly, by_positions, found, refined, quality, config)
 
 
-def _why_no_views(a: SourceScene, b: SourceScene, by_positions: Floats, settings: AggregationConfig) -> str:
+def _why_no_views(height_m: float, settings: AggregationConfig) -> str:
     """Reason for two scenes without a common view by their positions, heights of different datums among them."""
-    height_m = abs(height_between_m(a, b, by_positions))
     if height_m <= settings.position_error_m:
         return NO_COMMON_VIEWS
     return f"positions put one {height_m:.0f} m above the other: compare the height datums of their drives"

@@ -163,6 +163,12 @@ def test_heights_that_keep_views_apart_are_named(a: Driven, b: Driven) -> None:
     seam = seam_of(a, replace(b, source=high))
     assert not seam.accepted
     assert seam.reason == "positions put one 48 m above the other: compare the height datums of their drives"
+    finding = nothing_connected([seam], CONFIG.aggregation)
+    expected = (
+        "all scenes are placed by positions only: positions put scenes that meet above one another, by up to 48 m"
+    )
+    assert finding.what == expected
+    assert "height_datum" in finding.remedy
     elsewhere = seam_of(a, replace(b, source=high), configured(position_error_m=60.0))
     assert elsewhere.accepted, elsewhere.reason
 
