@@ -172,10 +172,18 @@ def _damaged(path: Path, name: str) -> Iterator[None]:
         StopIteration,
     ) as error:  # fmt: skip
         raise InputError(
-            f"scene {name}: {path} is damaged: {type(error).__name__}: {error}",
+            f"scene {name}: {path} is damaged: {type(error).__name__}: {_in_a_line(error)}",
             remedy="Copy or download the scene again, or reconstruct the drive again.",
             code="damaged-scene",
         ) from error
+
+
+def _in_a_line(error: Exception) -> str:
+    """The first problem that a validation found, or what an error says."""
+    if not isinstance(error, ValidationError):
+        return str(error)
+    first = error.errors()[0]
+    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
 
 
 def _document(path: Path, name: str) -> dict[str, Any]:
@@ -189,11 +197,7 @@ def _document(path: Path, name: str) -> dict[str, Any]:
 def _manifest(folder: Path, name: str) -> DriveManifest:
     path = folder / "manifest.json"
     with _damaged(path, name):
-        try:
-            return DriveManifest.model_validate_json(path.read_bytes())
-        except ValidationError as error:
-            first = error.errors()[0]
-            raise ValueError(f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+        return DriveManifest.model_validate_json(path.read_bytes())
 
 
 def _own_units(poses: dict[str, Any], registered: Bools, *, is_component: bool) -> Bools:
@@ -245,10 +249,13 @@ def _arrays(
     place: tuple[Floats | None, str | None],
 ) -> SourceScene:
     frame, poses, calibration, report = documents
-    units, images = poses["units"], poses["images"]
-    unit_registered = np.array([bool(unit["registered"]) for unit in units])
-    image_registered = np.array([bool(image["registered"]) for image in images])
-    world_from_rig = _poses(units, "world_from_rig")
+    with _damaged(folder / "poses.json", name):
+        units, images = poses["units"], poses["images"]
+        unit_registered = np.array([bool(unit["registered"]) for unit in units])
+        image_registered = np.array([bool(image["registered"]) for image in images])
+        world_from_rig, world_from_cam = _poses(units, "world_from_rig"), _poses(images, "world_from_cam")
+        sigma = [unit.get("sigma_position_m", [np.nan] * 3) for unit in units]
+        sigma_position_m = np.array(sigma, dtype=np.float64).reshape(-1, 3)
     listed = [image.file for frame in manifest.frames for image in frame.images.values()]
     if len(units) != len(manifest.frames) or sorted(listed) != sorted(image["file"] for image in images):
         raise ValueError("manifest.json and poses.json speak of different images")
@@ -256,11 +263,15 @@ def _arrays(
         [image["unit"] for image, posed in zip(images, image_registered, strict=True) if posed]
     ].all():
         raise ValueError("poses.json has images with a pose of units without one")
-    sigma = [unit.get("sigma_position_m", [np.nan] * 3) for unit in units]
     rig_from_cam = {c.name: matrix_from_pose(c.rig_from_cam) for c in manifest.rig.cameras}
-    model = read_images(folder / "model" / "images.bin")
-    points = read_points(folder / "model" / "points3D.bin")
-    first, xy, point, descriptors = _keypoints(folder, model, len(images), len(points.xyz_m))
+    with _damaged(folder / "model" / "images.bin", name):
+        model = read_images(folder / "model" / "images.bin")
+    with _damaged(folder / "model" / "points3D.bin", name):
+        points = read_points(folder / "model" / "points3D.bin")
+    with _damaged(folder / "points.ply", name):
+        classes = _point_classes(folder / "points.ply", len(points.xyz_m))
+    with _damaged(folder / "features.db", name):
+        first, xy, point, descriptors = _keypoints(folder, model, len(images), len(points.xyz_m))
     kind = features_kind(report)
     result = SourceScene(
         name=name,
@@ -274,18 +285,18 @@ def _arrays(
         ecef_from_local=np.full((4, 4), np.nan) if place[0] is None else place[0],
         unit_registered=unit_registered,
         world_from_rig=world_from_rig,
-        sigma_position_m=np.array(sigma, dtype=np.float64).reshape(-1, 3),
+        sigma_position_m=sigma_position_m,
         image_registered=image_registered,
         unit_from_image=unit_from_images(
             world_from_rig[[image["unit"] for image in images]],
-            _poses(images, "world_from_cam"),
+            world_from_cam,
             np.stack([rig_from_cam[image["camera"]] for image in images]),
             image_registered,
         ),
         points_m=points.xyz_m,
         point_colors=points.color,
         point_errors_px=points.error_px,
-        point_classes=_point_classes(folder / "points.ply", len(points.xyz_m)),
+        point_classes=classes,
         keypoint_first=first,
         keypoint_xy_px=xy,
         keypoint_point=point,
@@ -380,9 +391,10 @@ def _keypoints(
             counts[i] = len(found.xy_px)
             xy.append(found.xy_px)
             point.append(found.point)
-            rows, columns, data = db.execute(
-                "SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (i + 1,)
-            ).fetchone()
+            row = db.execute("SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (i + 1,)).fetchone()
+            if row is None:
+                raise ValueError(f"it has no descriptors of image {i + 1}")
+            rows, columns, data = row
             if rows != counts[i]:
                 raise ValueError(
                     f"features.db has {rows} descriptors of image {i + 1}, the model {counts[i]} keypoints"

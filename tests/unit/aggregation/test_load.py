@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +108,13 @@ def test_damage_is_said_by_name(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
+        ("poses.json", ["units", None], r"scene/poses.json is damaged"),
+        ("poses.json", ["units", 0, "sigma_position_m", [1.0]], r"scene/poses.json is damaged"),
+        (
+            "poses.json",
+            ["units", 0, "world_from_rig", "translation_m", 0, float("nan")],
+            r"poses.json is .* finite number\n",
+        ),
         ("poses.json", ["units", 0, "registered", False], "images with a pose of units without one"),
         ("poses.json", ["images", 0, "world_from_cam", "translation_m", 0, 3.0], "have different poses of .*000.png"),
         ("frame.json", ["ecef_from_local", 0, 3, 2e7], r"frame.json is damaged.* near the earth's surface"),
@@ -128,6 +137,24 @@ def test_files_that_no_run_has_written_are_refused_before_any_work(
     with pytest.raises(InputError, match=said) as raised:
         read_scene(folder, "one")
     assert raised.value.code == "damaged-scene"
+
+
+@pytest.mark.parametrize("file", ["model/images.bin", "model/points3D.bin", "points.ply", "features.db"])
+def test_the_file_that_is_damaged_is_named(folder: Path, file: str) -> None:
+    """What is said was that something in the scene's folder is."""
+    data = (folder / file).read_bytes()
+    (folder / file).write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match=rf"scene one: .*/scene/{file} is damaged: .*") as raised:
+        read_scene(folder, "one")
+    assert "\n" not in raised.value.what
+
+
+def test_descriptors_that_are_missing_are_named_by_their_image(folder: Path) -> None:
+    with closing(sqlite3.connect(folder / "features.db")) as database:
+        database.execute("DELETE FROM descriptors WHERE image_id = 1")
+        database.commit()
+    with pytest.raises(InputError, match=r"features.db is damaged: .* no descriptors of image 1\n"):
+        read_scene(folder, "one")
 
 
 def test_a_unit_that_is_not_where_its_images_are_is_refused(folder: Path) -> None:
