@@ -204,9 +204,23 @@ class MapCalibrations:
     learning: tuple[int, ...] = ()
     too_many: bool = False
 
-    def with_free_places(self) -> MapCalibrations:
-        """The same with cameras that vary in all directions of their places, within their priors."""
-        return replace(self, terms=[_with_free_places(term) for term in self.terms])
+    def with_looser_places(self) -> list[MapCalibrations]:
+        """These, and where places of cameras are held the same with all of their directions varying within priors.
+
+        Images see less of baselines that are held where they are not, the longer a scene is.
+        """
+        holds = any(isinstance(term, CameraPosePrior) and term.held[:, 3:].any() for term in self.terms)
+        return [self, *([replace(self, terms=[_with_free_places(term) for term in self.terms])] if holds else [])]
+
+    def as_found(self) -> MapCalibrations:
+        """The same with all cameras as the scenes found them."""
+        return replace(
+            self,
+            cameras=np.zeros_like(self.cameras),
+            free_intrinsics=np.zeros_like(self.free_intrinsics),
+            terms=(),
+            learning=(),
+        )
 
     def at_priors(self, state: State) -> State:
         """The state with cameras where their priors have them: from far off a prior hardly counts."""

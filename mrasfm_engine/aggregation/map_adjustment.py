@@ -18,7 +18,7 @@ from mrasfm_engine.aggregation.positions import DrivePositions, with_bias
 from mrasfm_engine.aggregation.seam_refinement import joined_points_m, tracks_of
 from mrasfm_engine.aggregation.vehicles import Vehicle
 from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chosen_points
-from mrasfm_engine.bundle_adjustment.priors import CameraPosePrior, Term, UprightPrior
+from mrasfm_engine.bundle_adjustment.priors import Term, UprightPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.config import EngineConfig
@@ -115,33 +115,68 @@ def adjust_map(
         config.bundle_adjustment,
         told_lengths=scenes_of_told_length(assembly, owner),
     )
-    free, cameras = calibrations.free_units, calibrations.cameras
-    problem = _with_cameras(problem, calibrations.at_priors(state))
+    free = calibrations.free_units
+    as_found, problem = problem, _with_cameras(problem, calibrations.at_priors(state))
     o, seen = problem.observations, np.zeros(tracks.count, dtype=np.bool_)
     seen[o.point[free[o.unit]]] = True
-    given = problem
-    problem, biased, reports = _varied(assembly, given, seen, free, positions, calibrations, cancel=cancel)
-    lengthened = lengthened_scenes(assembly, given.state, problem.state, free)
-    if lengthened and any(isinstance(term, CameraPosePrior) and term.held[:, 3:].any() for term in calibrations.terms):
-        # Images see less of baselines that are held where they are not, the longer a scene is: let them go instead.
-        loose = calibrations.with_free_places()
-        problem, biased, reports = _varied(assembly, given, seen, free, positions, loose, cancel=cancel)
-        lengthened = lengthened_scenes(assembly, given.state, problem.state, free)
-    positions = biased
-    problem = _others_refined(problem, seen, cameras)
+    attempts = [(problem, one) for one in calibrations.with_looser_places()]
+    if calibrations.cameras.any():
+        attempts.append((as_found, calibrations.as_found()))
+    varied = _least_lengthened(assembly, attempts, seen, positions, cancel=cancel)
+    problem, calibrations = varied.problem, varied.calibrations
+    problem = _others_refined(problem, seen, calibrations.cameras)
     model, observations, points_dropped = _filtered(assembly, problem, tracks.rows, owners, config)
     return AdjustedMap(
         model=model,
-        positions=positions,
-        reports=tuple(reports),
+        positions=varied.positions,
+        reports=tuple(varied.reports),
         free_units=int(free.sum()),
-        free_cameras=int(cameras.sum()),
+        free_cameras=int(calibrations.cameras.sum()),
         learning=calibrations.learning,
         too_many_cameras=calibrations.too_many,
         dropped_observations=observations,
         dropped_points=points_dropped,
-        lengthened=lengthened,
+        lengthened=varied.lengthened,
     )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Varied:
+    """A problem after its units and calibrations have varied, and the scenes that got longer than they may."""
+
+    problem: Problem
+    calibrations: MapCalibrations
+    positions: dict[int, DrivePositions]
+    reports: Sequence[Report]
+    lengthened: Mapping[int, float]
+
+    @property
+    def worst(self) -> float:
+        """The largest change of a scene's length that is more than it may be, as a logarithm."""
+        return max((abs(float(np.log(factor))) for factor in self.lengthened.values()), default=0.0)
+
+
+def _least_lengthened(
+    assembly: Assembly,
+    attempts: Sequence[tuple[Problem, MapCalibrations]],
+    seen: Bools,
+    positions: dict[int, DrivePositions],
+    *,
+    cancel: Callable[[], bool],
+) -> _Varied:
+    """The first of some attempts after which no scene is longer than it may be, or the one nearest to that."""
+    found = list[_Varied]()
+    for begun, calibrations in attempts:
+        free = calibrations.free_units
+        problem, biased, reports = _varied(assembly, begun, seen, free, positions, calibrations, cancel=cancel)
+        lengthened = lengthened_scenes(assembly, begun.state, problem.state, free)
+        one = _Varied(
+            problem=problem, calibrations=calibrations, positions=biased, reports=reports, lengthened=lengthened
+        )
+        found.append(one)
+        if not lengthened:
+            break
+    return min(found, key=lambda one: one.worst)
 
 
 def _varied(
