@@ -65,6 +65,10 @@ class SceneScale:
         """The scene is longer or shorter than by itself."""
         return self._off > SIGNIFICANT * self.sigma
 
+    def is_unexpected(self, scene: SourceScene) -> bool:
+        """True where the scene gets another length than it states to be possible, by one sigma."""
+        return self.is_significant and self._off > stated_sigma(scene)
+
     @property
     def _off(self) -> float:
         return abs(float(np.log(self.factor)))

@@ -389,7 +389,7 @@ def at_length(run: Run, found: Sequence[SourceScene], known: Association) -> lis
         scales = {int(k): SceneScale(**scale) for k, scale in kept[1].items()}
     for k, scale in scales.items():
         result[k] = _of_length(found[k], scale)
-        if scale.is_significant:
+        if scale.is_unexpected(found[k]):
             run.found(_scaled(found[k], scale))
     return result
 
@@ -435,7 +435,7 @@ def _scaled(scene: SourceScene, scale: SceneScale) -> Finding:
     return warning(
         "scene-scaled",
         f"scene {scene.name} is {scale.factor:.3f} times as long as by itself: {scale.by} says that to "
-        f"{100 * scale.sigma:.2f} %, where the scene knew its length to {100 * stated_sigma(scene):.1f} %",
+        f"{100 * scale.sigma:.2g} %, where the scene knew its length to {100 * stated_sigma(scene):.2g} %",
         "Give its drive GNSS, or sigma_translation_m of cameras that are known better.",
     )
 

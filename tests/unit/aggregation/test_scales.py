@@ -11,7 +11,7 @@ import pytest
 
 from mrasfm_engine.aggregation.load import read_scene
 from mrasfm_engine.aggregation.pipeline import aggregate
-from mrasfm_engine.aggregation.scales import find_scale, stated_sigma
+from mrasfm_engine.aggregation.scales import SceneScale, find_scale, stated_sigma
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
@@ -76,6 +76,16 @@ def test_what_a_report_says_of_the_scale_may_be_anything(street: Street, tmp_pat
     with pytest.raises(InputError) as raised:
         read_scene(folder, "tunnel")
     assert raised.value.code == "damaged-scene"
+
+
+@pytest.mark.parametrize(("factor", "unexpected"), [(1.005, False), (0.95, False), (1.1, True), (0.9, True)])
+def test_a_length_within_what_the_scene_states_is_expected(
+    street: Street, tmp_path: Path, factor: float, unexpected: bool
+) -> None:
+    scene = read_scene(in_tunnel(street, tmp_path / "tunnel"), "tunnel")
+    scale = SceneScale(by="lit", factor=factor, sigma=0.001, units=9)
+    assert scale.is_significant
+    assert scale.is_unexpected(scene) == unexpected
 
 
 @pytest.mark.parametrize("scale", [0.75, 1.0, 1.3])
