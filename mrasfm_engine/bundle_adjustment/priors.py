@@ -60,6 +60,11 @@ class CalibrationPrior:
         """Rotation vectors (rad) and translations (m) of all cameras (c, 6) from given to current, in rig axes."""
         return _corrections(state.camera_rotation, state.camera_position_m, self.rotation, self.position_m)
 
+    @property
+    def sigma(self) -> Floats:
+        """Declared standard deviations (c, 6) of rotations (rad), then of places (m)."""
+        return np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
+
     def with_weights(self, state: State, observing: Bools | None = None) -> CalibrationPrior:
         """This prior with the gauge's weights renewed from the corrections of a state.
 
@@ -88,7 +93,7 @@ class CalibrationPrior:
         return np.where(is_contradicted, sigma / np.sqrt(_loss_weights(whitened, self.loss_scale)), sigma)
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
-        sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1)
+        sigma = self.sigma
         return self.corrections(state) / sigma, sigma
 
     def _held(self) -> Bools:
@@ -104,7 +109,7 @@ class CalibrationPrior:
         """
         cameras = len(self.rotation)
         weights = np.full(cameras, 1.0 / cameras) if self.gauge_weights is None else self.gauge_weights
-        sigma = np.repeat(np.stack([self.sigma_rotation_rad, self.sigma_translation_m], 1), 3, axis=1).ravel()
+        sigma = self.sigma.ravel()
         mean = np.kron(np.tile(weights / weights.sum(), (cameras, 1)), np.eye(6))
         own = np.eye(6 * cameras) - mean * sigma[:, None] / sigma
         result: Floats = own @ covariance if covariance.ndim == 1 else own @ covariance @ own.T

@@ -119,7 +119,7 @@ def _sigmas(
 
     Errors of lens models turn and move a camera by more than a good calibration errs, and no repetition shows them.
     """
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    sigma = prior.sigma
     # The common scale may be off: it moves all cameras, and is no fault of one.
     posterior = np.maximum(np.nan_to_num(directions.ratio, nan=1.0) * directions.prior_sigma, 1e-9)
     allowed = sigma if systematic is None else np.hypot(sigma, systematic.sigma_camera(posterior))

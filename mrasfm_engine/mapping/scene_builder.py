@@ -114,7 +114,7 @@ def _time_offset(mapper: Mapper, refinement: Refinement, camera: int) -> dict[st
 
 def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibration]:
     prior: CalibrationPrior = calibration_prior(mapper)
-    sigma = np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
+    sigma = prior.sigma
     focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
     intrinsics = refinement.intrinsics
     asked = intrinsics is not None and intrinsics.asked

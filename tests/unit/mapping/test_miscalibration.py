@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
-from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.calibration import calibration_prior, observed_directions
 from mrasfm_engine.mapping.incremental_mapping import MappingLog, adjust_globally
@@ -56,11 +55,6 @@ def refined(simulated: SimulatedDrive) -> tuple[Mapper, Refinement]:
     mapper = with_true_poses(make_model(simulated), simulated, range(len(simulated.world_from_rig)))
     adjust_globally(mapper, MappingLog(), None)
     return mapper, refine(mapper)
-
-
-def declared(prior: CalibrationPrior) -> np.ndarray:
-    """Standard deviations (c, 6) of the cameras' rotations and places, as a manifest declares them."""
-    return np.repeat(np.stack([prior.sigma_rotation_rad, prior.sigma_translation_m], 1), 3, axis=1)
 
 
 def drive(given, *, straight: bool = False, points: int = 900) -> SimulatedDrive:  # type: ignore[no-untyped-def]
@@ -155,7 +149,7 @@ def test_of_two_cameras_only_the_pair_is_called_wrong() -> None:
     directions = Observability(
         observed=sees_rotations,
         ratio=np.where(sees_rotations, 0.01, np.nan),
-        prior_sigma=declared(prior),
+        prior_sigma=prior.sigma,
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
@@ -192,7 +186,7 @@ def test_what_lens_models_turn_a_camera_by_is_no_miscalibration(lenses_deg: floa
     directions = Observability(
         observed=np.ones((4, 6), dtype=np.bool_),
         ratio=np.full((4, 6), 0.1),
-        prior_sigma=declared(prior),
+        prior_sigma=prior.sigma,
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
@@ -215,7 +209,7 @@ def test_a_direction_that_is_hardly_known_makes_no_camera_wrong(about_y_deg: flo
     directions = Observability(
         observed=np.ones((4, 6), dtype=np.bool_),
         ratio=ratio,
-        prior_sigma=declared(prior),
+        prior_sigma=prior.sigma,
         scale_observed=False,
         scale_only_prior=False,
         sigma_scale=0.01,
