@@ -50,15 +50,6 @@ def binary_model_checks(
     ]
 
 
-def text_model_checks(scene: Scene) -> list[Check]:
-    """Checks of the text model."""
-    return [
-        Check("model/text/images.txt", readers.images_text, partial(comparisons.images, scene)),
-        Check("model/text/points3D.txt", readers.points_text, partial(comparisons.points_text, scene)),
-        Check("model/text", colmap_io.read_text, partial(comparisons.model, scene)),
-    ]
-
-
 def common_checks(scene: Scene) -> list[Check]:
     """Checks of the other files that scenes and maps have alike, but for those of `completing_checks`."""
     return [

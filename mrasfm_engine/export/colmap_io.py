@@ -1,4 +1,4 @@
-"""COLMAP's own reading and writing of whole models.
+"""COLMAP's own reading of whole models.
 
 COLMAP lets no other thread of the interpreter run meanwhile, for seconds where a drive is long: pictures that are drawn
 beside it wait, and nobody can cancel. Large models have a process of their own for it.
@@ -15,12 +15,10 @@ import numpy as np
 import pycolmap
 
 from mrasfm_engine.errors import MrasfmError
-from mrasfm_engine.export.file_contents import sha256
 from mrasfm_engine.subprocess_run import run_in_subprocess
 from mrasfm_engine.types import Floats, StageProgress
 
 BINARY_FILES = ("cameras.bin", "rigs.bin", "frames.bin", "images.bin", "points3D.bin")
-TEXT_FILES = ("cameras.txt", "rigs.txt", "frames.txt", "images.txt", "points3D.txt")
 # COLMAP reads and writes as much in the time that a process takes to start.
 SMALL_BYTES = 16_000_000
 
@@ -71,41 +69,18 @@ class ModelRead:
 
 def read_binary(folder: Path) -> ModelRead:
     """A binary model as COLMAP reads it."""
-    return _read(folder, BINARY_FILES, _read_binary)
+    return by_itself(_read_binary, folder)
 
 
-def read_text(folder: Path) -> ModelRead:
-    """A text model, likewise."""
-    return _read(folder, TEXT_FILES, _read_text)
+def binary_model(folder: Path) -> pycolmap.Reconstruction:
+    """COLMAP's own object of a binary model."""
+    model = pycolmap.Reconstruction()
+    model.read_binary(str(folder))
+    return model
 
 
-def read_binary_and_write_text(binary_folder: Path, folder: Path) -> tuple[ModelRead, dict[str, str]]:
-    """A binary model as COLMAP reads it, and the SHA-256 of the files, by name, of its text model in another folder.
-
-    COLMAP reads the model once for both.
-    """
-    _require_files(binary_folder, BINARY_FILES)
-    size_bytes = _size_bytes(binary_folder, BINARY_FILES)
-    return _by_itself(_read_binary_and_write_text, binary_folder, folder, size_bytes=size_bytes)
-
-
-def _read(folder: Path, names: Sequence[str], read: Callable[[Path], ModelRead]) -> ModelRead:
-    _require_files(folder, names)
-    return _by_itself(read, folder, size_bytes=_size_bytes(folder, names))
-
-
-def _require_files(folder: Path, names: Sequence[str]) -> None:
-    for name in names:
-        if not (folder / name).stat().st_size:  # without its file of rigs, COLMAP makes some up
-            raise ValueError(f"{name} is empty")
-
-
-def _size_bytes(folder: Path, names: Sequence[str]) -> int:
-    return sum((folder / name).stat().st_size for name in names)
-
-
-def _by_itself(work: Callable[..., Result], *arguments: Any, size_bytes: int) -> Result:
-    """The result of some work on a model of this size, in a process of its own where that is large.
+def by_itself(work: Callable[..., Result], folder: Path, *arguments: Any) -> Result:
+    """The result of some work on a binary model, the folder of which it gets first; a large one's in its own process.
 
     Raises
     ------
@@ -114,9 +89,12 @@ def _by_itself(work: Callable[..., Result], *arguments: Any, size_bytes: int) ->
     MrasfmError
         Where the process ended early.
     """
-    if size_bytes < SMALL_BYTES:
-        return work(*arguments)
-    ended = run_in_subprocess(_result_or_error, work, arguments)
+    sizes = {name: (folder / name).stat().st_size for name in BINARY_FILES}
+    for name in (name for name, size in sizes.items() if not size):
+        raise ValueError(f"{name} is empty")  # without its file of rigs, COLMAP makes some up
+    if sum(sizes.values()) < SMALL_BYTES:
+        return work(folder, *arguments)
+    ended = run_in_subprocess(_result_or_error, work, (folder, *arguments))
     if ended.result is None:
         raise MrasfmError(
             f"the process in which COLMAP reads or writes the model: {ended.failure}",
@@ -138,39 +116,27 @@ def _result_or_error(
         return error
 
 
-def _read_binary_and_write_text(binary_folder: Path, folder: Path) -> tuple[ModelRead, dict[str, str]]:
-    model = pycolmap.Reconstruction()
-    model.read_binary(str(binary_folder))
-    model.write_text(str(folder))
-    return _read_of(model), {name: sha256(folder / name) for name in TEXT_FILES}
-
-
 def _read_binary(folder: Path) -> ModelRead:
-    model = pycolmap.Reconstruction()
-    model.read_binary(str(folder))
-    return _read_of(model)
+    return read_of(binary_model(folder))
 
 
-def _read_text(folder: Path) -> ModelRead:
-    model = pycolmap.Reconstruction()
-    model.read_text(str(folder))
-    return _read_of(model)
-
-
-def _read_of(model: pycolmap.Reconstruction) -> ModelRead:
+def read_of(model: pycolmap.Reconstruction) -> ModelRead:
+    """The content of COLMAP's object."""
     points = np.reshape([point.xyz for point in model.points3D.values()], (-1, 3))
     posed = set(model.reg_image_ids())
     return ModelRead(
         rigs={number: _rig(rig) for number, rig in model.rigs.items()},
-        cameras={
-            number: CameraRead(model=camera.model.name, size_px=(camera.width, camera.height), params=camera.params)
-            for number, camera in model.cameras.items()
-        },
+        cameras={number: _camera(camera) for number, camera in model.cameras.items()},
         images={number: _image(image, number in posed) for number, image in model.images.items()},
         points=points[np.argsort(list(model.points3D))],
         observations=model.compute_num_observations(),
         is_valid=model.is_valid(),
     )
+
+
+def _camera(camera: pycolmap.Camera) -> CameraRead:
+    params = np.array(camera.params)  # a view would keep the whole model
+    return CameraRead(model=camera.model.name, size_px=(camera.width, camera.height), params=params)
 
 
 def _rig(rig: pycolmap.Rig) -> RigRead:

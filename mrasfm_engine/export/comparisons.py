@@ -76,7 +76,8 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
     for image in found:
         i = image.image_id - 1
         yield Row(f"image {image.image_id}", i in missing, True)
-        yield Row(f"the name of image {image.image_id}", image.name, scene.drive.images[i].file)
+        named = (image.name, image.camera_id)
+        yield Row(f"image {image.image_id}", named, (scene.drive.images[i].file, scene.drive.images[i].camera + 1))
         read.append((image.name, image.cam_from_world))
         expected.append(missing.pop(i))
         yield Row(f"a keypoint of {image.name}", image.xy_px, scene.features[i].xy_px, POSE_TOLERANCE)
@@ -156,25 +157,6 @@ def _baselines(scene: Scene, centres: Floats) -> Rows:
             if len(lengths):
                 what = f"rigs: the distance of cameras {cameras[a]} and {cameras[b]}"
                 yield Row(what, float(np.ptp(lengths)), 0.0, POSE_TOLERANCE)
-
-
-def points_text(scene: Scene, found: Iterator[ModelPoints]) -> Rows:
-    """Every point, its colour and its track."""
-    times_read = np.zeros(len(scene.points_m), dtype=np.int64)
-    first = np.searchsorted(scene.observation_point, np.arange(len(scene.points_m) + 1))
-    for part in found:
-        index = part.ids - 1
-        none_such = part.ids[(index < 0) | (index >= len(times_read))]
-        yield Row("a point id", none_such, none_such[:0])
-        np.add.at(times_read, index, 1)
-        yield Row("a point", part.xyz, scene.points_m[index], POSE_TOLERANCE)
-        yield Row("a colour", part.colors, scene.point_colors[index], 0.0)
-        counts = first[index + 1] - first[index]
-        rows = np.arange(counts.sum()) + np.repeat(first[index] - np.cumsum(counts) + counts, counts)
-        observations = (scene.observation_point[rows], scene.observation_image[rows], scene.observation_keypoint[rows])
-        expected = np.column_stack(observations) + np.array([1, 1, 0])
-        yield Row("a track", _sorted_rows(part.observations), _sorted_rows(expected))
-    yield Row("the number of its lines about a point", times_read, np.ones_like(times_read))
 
 
 def points_binary(scene: Scene, found: ModelPoints) -> Rows:
@@ -383,8 +365,3 @@ def _ecef(places: list[dict[str, float]]) -> Floats:
     fields = ("longitude_deg", "latitude_deg", "ellipsoidal_height_m")
     rows = np.array([[place[field] for field in fields] for place in places]).reshape(-1, 3)
     return np.stack(to_ecef.transform(*rows.T), -1)
-
-
-def _sorted_rows(rows: Ints) -> Ints:
-    result: Ints = rows[np.lexsort(rows.T)]
-    return result

@@ -1,8 +1,8 @@
 """Readers of a result's files, for the check before it is put in place.
 
 They share no code with the writers: rotations are composed with scipy, the database is read with SQLite, COLMAP reads
-its model (`colmap_io`). What COLMAP overlooks is parsed here: the poses that the image files hold one by one, and the
-points that they name.
+its binary model (`colmap_io`). What COLMAP overlooks is parsed here: the poses that the image files hold one by one,
+and the points that they name.
 """
 
 from __future__ import annotations
@@ -21,17 +21,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
+from mrasfm_engine.export.colmap_io import CameraRead, RigRead
 from mrasfm_engine.io.read_model import read_vertices
-from mrasfm_engine.types import Floats, Ints
+from mrasfm_engine.types import Bytes, Floats, Ints
 from schemas import DriveManifest
 
+CAMERA, IMU = "CAMERA", "IMU"  # sensors, in a text model
 POINTS_AT_ONE_TIME = 20_000
+POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")])
+
+
+class ModelFrame(NamedTuple):
+    """A frame of a COLMAP model."""
+
+    rig_id: int
+    rig_from_world: Floats  # (4, 4)
+    cameras: dict[int, int]  # by image
 
 
 class ModelImage(NamedTuple):
     """Content of an image in a COLMAP model."""
 
     image_id: int
+    camera_id: int
     name: str
     cam_from_world: Sequence[float]  # (7,) quaternion w x y z, translation
     xy_px: Floats  # (n, 2)
@@ -106,12 +118,11 @@ def images_binary(path: Path) -> Iterator[ModelImage]:
     with path.open("rb") as file:
         (images,) = struct.unpack("<Q", _exactly(file, 8))
         for _ in range(images):
-            image_id, *numbers = struct.unpack("<I7d", _exactly(file, 60))
-            _exactly(file, 4)  # the camera's id
+            image_id, *numbers, camera_id = struct.unpack("<I7dI", _exactly(file, 64))
             name = b"".join(iter(partial(_exactly, file, 1), b"\0")).decode("utf-8")
             (count,) = struct.unpack("<Q", _exactly(file, 8))
             rows = np.frombuffer(_exactly(file, 24 * count), dtype=[("xy", "<f8", 2), ("point", "<i8")])
-            yield ModelImage(image_id, name, numbers, rows["xy"], rows["point"])
+            yield ModelImage(image_id, camera_id, name, numbers, rows["xy"], rows["point"])
         left = len(file.read(1))
     if left:
         raise ValueError("bytes are left over")
@@ -124,6 +135,56 @@ def _exactly(file: BinaryIO, count: int) -> bytes:
     return data
 
 
+def cameras_text(path: Path) -> dict[int, CameraRead]:
+    """The cameras of a text model by their ids."""
+    return {
+        int(number): CameraRead(model=model, size_px=(int(width), int(height)), params=np.array(params, np.float64))
+        for number, model, width, height, *params in _lines(path)
+    }
+
+
+def rigs_text(path: Path) -> dict[int, RigRead]:
+    """The rigs of a text model by their ids."""
+    rigs = {}
+    for number, sensors, reference, _, *words in _lines(path):
+        poses, rest = {}, iter(words)
+        for kind, sensor, has_pose in zip(rest, rest, rest, strict=False):
+            pose = _pose(list(islice(rest, 7 * int(has_pose))))
+            if kind == CAMERA:
+                poses[int(sensor)] = pose[:3]
+        rigs[int(number)] = RigRead(sensors=int(sensors), reference_is_imu=reference == IMU, cam_from_rig=poses)
+    return rigs
+
+
+def frames_text(path: Path) -> dict[int, ModelFrame]:
+    """The frames of a text model by their ids."""
+    frames = {}
+    for number, rig, *words in _lines(path):
+        count, kinds = int(words[7]), words[8::3]
+        cameras = {int(image): int(camera) for camera, image in zip(words[9::3], words[10::3], strict=True)}
+        if kinds != [CAMERA] * count or len(cameras) != count:
+            raise ValueError(f"frame {number} has other data than images")
+        frames[int(number)] = ModelFrame(int(rig), _pose(words[:7]), cameras)
+    return frames
+
+
+def _lines(path: Path) -> Iterator[list[str]]:
+    """Words of the lines of a text model's file, without its head."""
+    with path.open(encoding="utf-8", newline="\n") as file:
+        for line in file:
+            if not line.startswith("#"):
+                if not line.endswith("\n"):
+                    raise ValueError("it ends early")
+                yield line.split()
+
+
+def _pose(words: Sequence[str]) -> Floats:
+    """A pose (4, 4) of COLMAP's seven numbers."""
+    w, x, y, z, *translation = (float(word) for word in words)
+    pose: Floats = transforms([x, y, z, w], translation)[0]
+    return pose
+
+
 def images_text(path: Path) -> Iterator[ModelImage]:
     """All images of a text model."""
     with path.open(encoding="utf-8", newline="\n") as file:
@@ -132,9 +193,10 @@ def images_text(path: Path) -> Iterator[ModelImage]:
             keypoints = next(lines, "")
             if not keypoints.endswith("\n"):
                 raise ValueError("it ends early")
-            image_id, *numbers, _, name = head.removesuffix("\n").split(" ", maxsplit=9)
+            image_id, *numbers, camera_id, name = head.removesuffix("\n").split(" ", maxsplit=9)
             rows = _numbers(keypoints).reshape(-1, 3)
-            yield ModelImage(int(image_id), name, [float(v) for v in numbers], rows[:, :2], rows[:, 2])
+            pose = [float(v) for v in numbers]
+            yield ModelImage(int(image_id), int(camera_id), name, pose, rows[:, :2], rows[:, 2])
 
 
 def points_text(path: Path) -> Iterator[ModelPoints]:
@@ -164,22 +226,31 @@ def _points_of_lines(lines: Sequence[str]) -> ModelPoints:
 
 def points_binary(path: Path) -> ModelPoints:
     """All points of a binary model."""
-    head = struct.Struct("<Q3d3BdQ")
-    data = path.read_bytes()
+    data, at, starts = path.read_bytes(), 8, []
     (count,) = struct.unpack_from("<Q", data)
-    at, heads, tracks = 8, [], []
     for _ in range(count):
-        *values, length = head.unpack_from(data, at)
-        at += head.size
-        track = np.frombuffer(data, "<u4", count=2 * length, offset=at).reshape(length, 2).astype(np.int64)
-        at += track.size * 4
-        heads.append(values)
-        tracks.append(np.column_stack([np.full(length, values[0]), track]))
+        starts.append(at)
+        (length,) = struct.unpack_from("<Q", data, at + POINT_HEAD.itemsize - 8)
+        at += POINT_HEAD.itemsize + 8 * length
     if at != len(data):
-        raise ValueError("bytes are left over")
-    rows = np.array(heads, dtype=np.float64).reshape(-1, 8)
-    observations = np.concatenate([np.zeros((0, 3), np.int64), *tracks])
-    return ModelPoints(rows[:, 0].astype(np.int64), rows[:, 1:4], rows[:, 4:7], rows[:, 7], observations)
+        raise ValueError("bytes are left over" if at < len(data) else "it ends early")
+    contents, ends = np.frombuffer(data, dtype=np.uint8), [*starts[::POINTS_AT_ONE_TIME][1:], at]
+    parts = [
+        _points_of_bytes(contents[starts[k] : end], np.array(starts[k : k + POINTS_AT_ONE_TIME]) - starts[k])
+        for k, end in zip(range(0, count, POINTS_AT_ONE_TIME), ends, strict=False)
+    ] or [_points_of_bytes(contents[:0], np.zeros(0, dtype=np.int64))]
+    return ModelPoints(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _points_of_bytes(contents: Bytes, starts: Ints) -> ModelPoints:
+    at_heads = starts[:, None] + np.arange(POINT_HEAD.itemsize)
+    heads = contents[at_heads].view(POINT_HEAD)[:, 0]
+    in_tracks = np.ones(len(contents), dtype=bool)
+    in_tracks[at_heads] = False
+    ids, lengths = heads["id"].astype(np.int64), heads["length"].astype(np.int64)
+    tracks = contents[in_tracks].view("<u4").reshape(-1, 2)
+    observations = np.column_stack([np.repeat(ids, lengths), tracks])
+    return ModelPoints(ids, heads["xyz"], heads["color"].astype(np.float64), heads["error"], observations)
 
 
 def _numbers(text: str) -> Floats:

@@ -25,7 +25,6 @@ from mrasfm_engine.errors import CancelledError, MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
-    colmap_io,
     comparisons,
     coordinate_frame,
     feature_database,
@@ -42,13 +41,14 @@ from mrasfm_engine.export.check import (
     binary_model_checks,
     common_checks,
     completing_checks,
-    text_model_checks,
 )
+from mrasfm_engine.export.colmap_io import ModelRead
 from mrasfm_engine.export.file_contents import write_content
 from mrasfm_engine.export.interchange import Interchange
 from mrasfm_engine.export.picture_files import PictureFiles
 from mrasfm_engine.export.publishing import COMPLETE_MARK, publishing, require_space
 from mrasfm_engine.export.report_page import scene_page, write_page
+from mrasfm_engine.export.text_model import TextModel, write_text_model
 from mrasfm_engine.io.images import mask_png
 from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.scene.scene import Scene
@@ -283,15 +283,16 @@ def _check_model(
     if not colmap.text_model_fits(scene):
         read_back.check(binary_model_checks(scene))
         return
-    text = work / "model" / "text"
+    text, made = work / "model" / "text", list[TextModel]()
 
-    def read_and_translate(folder: Path) -> colmap_io.ModelRead:
+    def read_and_translate(folder: Path) -> ModelRead:
         text.mkdir()
-        found, digests = colmap_io.read_binary_and_write_text(folder, text)
-        read_back.expect({f"model/text/{name}": digest for name, digest in digests.items()})
-        return found
+        made.append(write_text_model(folder, text))
+        read_back.expect({f"model/text/{name}": digest for name, digest in made[0].digests.items()})
+        return made[0].binary
 
-    for check in (*binary_model_checks(scene, read_and_translate), *text_model_checks(scene)):
+    text_check = Check("model/text", lambda folder: made[0].require_equal(), comparisons.nothing)
+    for check in (*binary_model_checks(scene, read_and_translate), text_check):
         require_going_on()
         read_back.check([check])
 

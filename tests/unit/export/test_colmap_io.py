@@ -11,6 +11,7 @@ import pytest
 
 from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import colmap, colmap_io, comparisons
+from mrasfm_engine.export.text_model import write_text_model
 from mrasfm_engine.scene.scene import Scene
 from tests.helpers.export_example import make_scene
 
@@ -39,20 +40,20 @@ def faults(scene: Scene, found: colmap_io.ModelRead) -> list[str]:
 def test_a_large_model_is_read_and_written_as_a_small_one_is(
     scene: Scene, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model, small = colmap_io.read_binary_and_write_text(folder, folder / "text")
-    assert faults(scene, model) == []
-    texts = {name: (folder / "text" / name).read_bytes() for name in small}
+    small = write_text_model(folder, folder / "text")
+    assert (faults(scene, small.binary), small.fault) == ([], "")
+    texts = {name: (folder / "text" / name).read_bytes() for name in small.digests}
     monkeypatch.setattr(colmap_io, "SMALL_BYTES", 0)
     monkeypatch.setattr(pycolmap, "Reconstruction", None)  # this process must not need it
     for name in texts:
         (folder / "text" / name).unlink()
-    model, large = colmap_io.read_binary_and_write_text(folder, folder / "text")
-    assert faults(scene, model) == []
-    assert large == small
-    assert {name: (folder / "text" / name).read_bytes() for name in small} == texts
-    for found in (colmap_io.read_binary(folder), colmap_io.read_text(folder / "text")):
-        assert faults(scene, found) == []
-        assert len(found.points) == len(scene.points_m) > 0
+    large = write_text_model(folder, folder / "text")
+    assert (faults(scene, large.binary), large.fault) == ([], "")
+    assert large.digests == small.digests
+    assert {name: (folder / "text" / name).read_bytes() for name in texts} == texts
+    found = colmap_io.read_binary(folder)
+    assert faults(scene, found) == []
+    assert len(found.points) == len(scene.points_m) > 0
 
 
 @pytest.mark.usefixtures("nothing_is_small")

@@ -11,13 +11,13 @@ from mrasfm_engine.errors import MrasfmError
 from mrasfm_engine.export import (
     calibration,
     colmap,
-    colmap_io,
     comparisons,
     coordinate_frame,
     feature_database,
     ply,
     pose_files,
 )
+from mrasfm_engine.export import scene as scene_export
 from mrasfm_engine.export.scene import write_scene
 from mrasfm_engine.scene.scene import Scene
 from tests.helpers.export_example import assert_nothing_published, make_scene
@@ -119,7 +119,7 @@ def tum_with_gap(original: Any, scene: Scene) -> str:
         ),
         (colmap, "_points", with_swapped_points, "model .*points3D: a point"),
         (colmap, "_points", lambda original, scene: b"", "model .*points3D.bin is empty"),
-        (colmap_io, "read_binary_and_write_text", text_without_end, "images.txt"),
+        (scene_export, "write_text_model", text_without_end, "images.txt"),
         (ply, "write_ply", ply_without_end, "points.ply"),
         (ply, "write_ply", with_swapped_points, "points.ply"),
         (feature_database, "write_features", without_a_pair, "features.db"),
