@@ -11,6 +11,9 @@ where A interpolates linearly between knots and P is the precision of the proces
 error jumps, the process begins anew: samples after a jump are later by a time in which it forgets everything. Its
 derivatives in the poses are those of e at the best d. Its Gauss-Newton matrix is J'WJ - G M^-1 G' with G = -J'W D,
 M = P + D'WD and D = wander A / sigma: the Schur complement of d, which `Extra.add_auxiliary` takes as G and M.
+
+A clock that is off moves all positions along the way, by speed times its offset. Where it may be, the offset is one
+more state, in standard deviations of what is known of it: D has a column c = velocity sigma_clock / sigma, P a one.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ from mrasfm_engine.types import Floats, Ints
 
 AXES = 3
 MAX_KNOTS = 64  # of a drive: the width that they add to the reduced system is three times that
-MAX_REWEIGHTINGS = 30  # of the loss for one value of the poses
+MAX_REWEIGHTINGS = 60  # of the loss for one value of the poses
 SAME_WEIGHTS = 1e-7
 FORGOTTEN = 50.0  # correlation times, after which nothing is left: exp(-50)
 
@@ -57,6 +60,7 @@ class ReceiverPositions:
     knots_s: Floats  # (k,) ascending, of the process, see `time_of_process_s`
     wander_time_s: float  # correlation time of the wandering part
     segment: Ints | None = None  # (n,) numbers of the parts between which the error jumps; None for one
+    clock_m: Floats | None = None  # (n, 3) by which a clock that is ahead by a sigma moves them; None if it is right
     loss_scale: float = 3.0
 
     def bounded(self, largest_m: float) -> tuple[ReceiverPositions, Floats]:
@@ -78,10 +82,11 @@ class ReceiverPositions:
         wander_time_s: float,
         least_spacing_s: float,
         segment: Ints | None = None,
+        clock_m: Floats | None = None,
     ) -> ReceiverPositions:
         """The term of samples (n,), in the order of time, with knots where they are needed.
 
-        `segment` (n,) numbers the parts between which the error jumps.
+        `segment` (n,) numbers the parts between which the error jumps. See the class for `clock_m`.
 
         Their errors (n, 3) have an independent and a wandering part. Knots are `least_spacing_s` apart, farther on
         drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that
@@ -112,6 +117,7 @@ class ReceiverPositions:
             knots_s=knots_s,
             wander_time_s=wander_time_s,
             segment=segment,
+            clock_m=clock_m,
         )
 
     def of_rows(self, rows: Ints, unit: Ints, share: Floats) -> ReceiverPositions:
@@ -124,6 +130,7 @@ class ReceiverPositions:
             wander_m=self.wander_m[rows],
             time_s=self.time_s[rows],
             segment=None if self.segment is None else self.segment[rows],
+            clock_m=None if self.clock_m is None else self.clock_m[rows],
         )
 
     @cached_property
@@ -150,6 +157,11 @@ class ReceiverPositions:
         """Wandering part over the independent one (n, 3)."""
         return self.wander_m / self.sigma_m
 
+    @cached_property
+    def _clock(self) -> Floats:
+        """The clock's column c (n, 3); zero where it is right."""
+        return np.zeros_like(self.sigma_m) if self.clock_m is None else self.clock_m / self.sigma_m
+
     def _by_knots(self, weights: Floats, axis: int) -> Floats:
         """M (2, k) of one axis, as `_precision` has it."""
         before, after, share = self._places
@@ -169,62 +181,75 @@ class ReceiverPositions:
         np.add.at(result, after, weighted * share[:, None])
         return result
 
-    def _at_samples(self, states: Floats) -> Floats:
-        """D d (n, 3) of states (k, 3)."""
+    def _at_samples(self, states: Floats, clock: float) -> Floats:
+        """D d (n, 3) of states (k, 3) and that of the clock."""
         before, after, share = self._places
         blend = states[before] + share[:, None] * (states[after] - states[before])
-        result: Floats = self._gain * blend
+        result: Floats = self._gain * blend + self._clock * clock
         return result
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
         return antenna_residuals(state, self.unit, self.lever_arm_m, self.position_m, self.sigma_m)
 
-    def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats]:
-        """The states (k, 3) that cost least, residuals (n, 3) and robust weights (n,) with them."""
-        states = np.empty((len(self.knots_s), AXES))
+    def _best(self, whitened: Floats) -> tuple[Floats, float, Floats, Floats]:
+        """The states (k, 3) and that of the clock that cost least, with residuals (n, 3) and robust weights (n,)."""
+        states, clock = np.empty((len(self.knots_s), AXES)), np.zeros(1)
         residuals, weights = np.empty_like(whitened), np.ones(len(whitened))
         _find_best_states(
-            whitened, self._gain, *self._places, self._precision, self.loss_scale, states, residuals, weights
-        )
-        return states, residuals, weights
+            whitened, self._gain, self._clock, self.clock_m is not None, *self._places, self._precision,
+            self.loss_scale, states, clock, residuals, weights,
+        )  # fmt: skip
+        return states, float(clock[0]), residuals, weights
 
     def errors_m(self, state: State) -> Floats:
-        """The wandering part (n, 3) of the measured positions' errors, as the poses of a state let it be seen."""
-        states = self._best(self._whitened(state)[1])[0]
-        result: Floats = -self._at_samples(states) * self.sigma_m
+        """The part (n, 3) of the positions' errors that wanders or is the clock's, as the poses of a state show it."""
+        states, clock, _, _ = self._best(self._whitened(state)[1])
+        result: Floats = -self._at_samples(states, clock) * self.sigma_m
         return result
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        states, residuals, _ = self._best(self._whitened(state)[1])
+        states, clock, residuals, _ = self._best(self._whitened(state)[1])
         off, diagonal = self._precision
         prior = (diagonal[:, None] * states**2).sum() + 2.0 * (off[1:, None] * states[1:] * states[:-1]).sum()
-        return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior)
+        return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior + clock**2)
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         arm, whitened = self._whitened(state)
-        _, r, w = self._best(whitened)
+        _, _, r, w = self._best(whitened)
         free, j_w, slots = add_to_units(layout, extra, self.unit, antenna_jacobian(arm, self.sigma_m), r, w)
-        if not (len(free) and self.wander_m.any()):
+        if not (len(free) and (self.wander_m.any() or self.clock_m is not None)):
             return
         count, (before, after, share) = len(self.knots_s), self._places
         with_units = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
         for knot, part in ((before, 1.0 - share), (after, share)):
             np.add.at(with_units, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
-        with_units = np.moveaxis(with_units, 1, 3)
-        square = np.zeros((AXES * count, AXES * count))
+        with_process = np.moveaxis(with_units, 1, 3).reshape(-1, AXES * count)
+        with_clock = np.zeros((layout.num_units, UNIT_DOF))
+        np.add.at(with_clock, slots, -(j_w @ self._clock[free, :, None])[..., 0])
+        square = np.eye(AXES * count + 1)
         for axis in range(AXES):
+            own = slice(axis * count, (axis + 1) * count)
             off, diagonal = self._by_knots(w, axis)
-            own = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
-            square[axis * count : (axis + 1) * count, axis * count : (axis + 1) * count] = own
-        extra.add_auxiliary(with_units.reshape(-1, AXES * count), square)
+            square[own, own] = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
+            square[own, -1] = square[-1, own] = self._at_knots((w * self._clock[:, axis])[:, None], axis)[:, 0]
+        square[-1, -1] += (w[:, None] * self._clock**2).sum()
+        extra.add_auxiliary(np.column_stack([with_process, with_clock.ravel()]), square)
 
     def information(self, columns: Floats) -> Floats:
         """Information X' C^-1 X (m, m) on m ways (n, 3, m) in which the antenna may be moved in metres.
 
         C is the covariance of the positions' errors, with all of them at full weight.
         """
+        if self.clock_m is None:
+            return self._information_by_process(columns)
+        known = self._information_by_process(np.concatenate([columns, self.clock_m[:, :, None]], axis=2))
+        result: Floats = known[:-1, :-1] - np.outer(known[:-1, -1], known[-1, :-1]) / (1.0 + known[-1, -1])
+        return result
+
+    def _information_by_process(self, columns: Floats) -> Floats:
+        """The same where the clock is right."""
         scaled = columns / self.sigma_m[:, :, None]
         result: Floats = np.einsum("nam,nal->ml", scaled, scaled)
         for axis in range(AXES):
@@ -245,6 +270,8 @@ class ReceiverPositions:
         prior = _log_determinant(self._precision)
         for axis in range(AXES):
             determinant += _log_determinant(self._by_knots(np.ones(len(off_m)), axis)) - prior
+        if self.clock_m is not None:
+            determinant += np.log1p(self._information_by_process(self.clock_m[:, :, None])[0, 0])
         return -0.5 * (left + float(determinant))
 
     def information_given(self, way: Floats, others: Floats) -> float:
@@ -264,41 +291,63 @@ def time_of_process_s(time_s: Floats, segment: Ints | None, wander_time_s: float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_best_states(
-    whitened: Any, gain: Any, before: Any, after: Any, share: Any, precision: Any, loss_scale: float,
-    states: Any, residuals: Any, weights: Any,
+    whitened: Any, gain: Any, clock_gain: Any, clock_varies: bool, before: Any, after: Any, share: Any, precision: Any,
+    loss_scale: float, states: Any, clock: Any, residuals: Any, weights: Any,
 ) -> None:  # fmt: skip
     """Find the states (k, 3), k > 0, by iteratively reweighted least squares, with their residuals and weights.
 
-    M and D'Wv, as `_by_knots` and `_at_knots` have them, are formed and solved without an array in between.
+    M and D'Wv, as `_by_knots` and `_at_knots` have them, are formed and solved without an array in between. The clock's
+    state (1,) is eliminated last: `moved` is what the process makes of its column.
     """
     count = len(states)
     diagonal, off = np.empty(count), np.empty(count)  # of M, and its superdiagonal, whose first entry is unused
+    moved = np.zeros((count, AXES))
     for _ in range(MAX_REWEIGHTINGS):
         for axis in range(AXES):
-            diagonal[:], off[:], states[:, axis] = precision[1], precision[0], 0.0
+            diagonal[:], off[:], states[:, axis], moved[:, axis] = precision[1], precision[0], 0.0, 0.0
             for i in range(len(whitened)):
                 a, b, later = before[i], after[i], share[i]
                 own = gain[i, axis]
                 weight, right = weights[i] * own * own, weights[i] * own * whitened[i, axis]
+                by_clock = weights[i] * own * clock_gain[i, axis]
                 diagonal[a] += weight * (1.0 - later) ** 2
                 states[a, axis] += right * (1.0 - later)
+                moved[a, axis] += by_clock * (1.0 - later)
                 if b > a:
                     diagonal[b] += weight * later**2
                     off[b] += weight * later * (1.0 - later)
                     states[b, axis] += right * later
+                    moved[b, axis] += by_clock * later
             for k in range(1, count):
                 factor = off[k] / diagonal[k - 1]
                 diagonal[k] -= factor * off[k]
                 states[k, axis] -= factor * states[k - 1, axis]
+                moved[k, axis] -= factor * moved[k - 1, axis]
             states[count - 1, axis] /= diagonal[count - 1]
+            moved[count - 1, axis] /= diagonal[count - 1]
             for k in range(count - 2, -1, -1):
                 states[k, axis] = (states[k, axis] - off[k + 1] * states[k + 1, axis]) / diagonal[k]
+                moved[k, axis] = (moved[k, axis] - off[k + 1] * moved[k + 1, axis]) / diagonal[k]
+        if clock_varies:
+            known, wanted = 1.0, 0.0
+            for i in range(len(whitened)):
+                a, b, later = before[i], after[i], share[i]
+                for axis in range(AXES):
+                    left = clock_gain[i, axis] - gain[i, axis] * (
+                        moved[a, axis] + later * (moved[b, axis] - moved[a, axis])
+                    )
+                    known += weights[i] * left * clock_gain[i, axis]
+                    wanted += weights[i] * left * whitened[i, axis]
+            clock[0] = wanted / known
+            for k in range(count):
+                for axis in range(AXES):
+                    states[k, axis] -= clock[0] * moved[k, axis]
         change = 0.0
         for i in range(len(whitened)):
             squared = 0.0
             for axis in range(AXES):
                 own = states[before[i], axis] + share[i] * (states[after[i], axis] - states[before[i], axis])
-                residuals[i, axis] = whitened[i, axis] - gain[i, axis] * own
+                residuals[i, axis] = whitened[i, axis] - gain[i, axis] * own - clock_gain[i, axis] * clock[0]
                 squared += residuals[i, axis] ** 2
             renewed = 1.0 / (1.0 + squared / loss_scale**2)
             change = max(change, abs(renewed - weights[i]))

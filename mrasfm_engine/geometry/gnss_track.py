@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -44,6 +44,10 @@ class GnssTrack:
     def interval_us(self) -> float:
         """Usual time between good samples; 0 where there are not two."""
         return float(np.median(np.diff(self.timestamps_us[self.good]))) if self.good.sum() > 1 else 0.0
+
+    def later_by(self, offset_s: float) -> GnssTrack:
+        """The track if its positions were taken by so much later."""
+        return replace(self, timestamps_us=self.timestamps_us + round(offset_s * 1e6))
 
     def at(self, timestamps_us: Ints, *, max_gap_us: int, way_m: Floats | None = None) -> tuple[Floats, Floats]:
         """Positions and sigmas (m, 3) at other times, between good samples; NaN outside and in larger gaps.

@@ -16,12 +16,20 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import factor_by_gnss, place_by_gnss, positions_of_units, reassess_positions
+from mrasfm_engine.mapping.placement import (
+    factor_by_gnss,
+    find_clock,
+    place_by_gnss,
+    positions_of_units,
+    reassess_positions,
+)
+from mrasfm_engine.mapping.receiver_clock import ReceiverClock
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
 from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.types import Bools, Floats, Ints
 
+CLOCK_ROUNDS = 4  # of finding the receiver's clock, as positions show it along tangents of the way
 LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
 
 
@@ -50,6 +58,7 @@ class AbsolutePriors:
     rough: Placement | None = None
     rough_rotations: RotationPrior | None = None
     placed_by_rough_poses: bool = False
+    clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
     @staticmethod
@@ -91,15 +100,19 @@ class AbsolutePriors:
         self.placed_by_rough_poses = False
         if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
-        if self.gnss is not None and self.antenna_in_rig_m is not None:
-            self.placement = place_by_gnss(
-                mapper,
-                self.gnss,
-                self.antenna_in_rig_m,
-                sigma_scale=sigma_scale,
-                rig_may_be_wrong=rig_may_be_wrong,
-                thorough=True,
-            )
+        for _ in range(CLOCK_ROUNDS):
+            if self.gnss is not None and self.antenna_in_rig_m is not None:
+                self.placement = place_by_gnss(
+                    mapper,
+                    self.gnss,
+                    self.antenna_in_rig_m,
+                    sigma_scale=sigma_scale,
+                    rig_may_be_wrong=rig_may_be_wrong,
+                    thorough=True,
+                    clock=self.clock,
+                )
+            if not self._set_clock(mapper):
+                break
         sigma = mapper.drive.manifest.rough_poses
         if self.positions is None and self.rough_world_from_rig is not None and sigma is not None:
             self.placed_by_rough_poses = place_by_rough_poses(
@@ -138,7 +151,7 @@ class AbsolutePriors:
         if self.positions is not None:
             self.reassess(mapper, thorough=False)
         elif self.gnss is not None and self.antenna_in_rig_m is not None:
-            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m)
+            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, clock=self.clock)
         if self.placement is not None and self.placement.is_contradicted:
             self.placement = None
         self._renew_rough(mapper)
@@ -148,11 +161,27 @@ class AbsolutePriors:
     def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:
         """Judge positions and rough poses by the adjusted scene."""
         if self.placement is not None and self.placement.prior is not None:
-            self.placement = reassess_positions(
-                mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
-            )
+            for _ in range(CLOCK_ROUNDS):
+                self.placement = reassess_positions(
+                    mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
+                )
+                if not (thorough and self._set_clock(mapper)):
+                    break
         if self.rough is not None:
             self._renew_rough(mapper)
+
+    def _set_clock(self, mapper: Mapper) -> bool:
+        """Give samples the times that positions show; whether these are others than before."""
+        if self.placement is None or self.placement.prior is None or self.gnss is None or self.clock_varies:
+            return False
+        before, found = self.clock, find_clock(mapper, self.placement)
+        found = found if found is not None and found.is_wrong else None
+        if found is before or (found is not None and before is not None and found.is_as(before)):
+            return False
+        offset_s, before_s = (0.0 if clock is None else clock.offset_s for clock in (found, before))
+        self.gnss, self.clock = self.gnss.later_by(offset_s - before_s), found
+        self.placement = replace(self.placement, track=self.gnss, clock=found)
+        return True
 
     def _renew_rough(self, mapper: Mapper) -> None:
         self.rough, self.rough_rotations = None, None

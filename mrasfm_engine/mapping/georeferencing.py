@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import rotation_between
 from mrasfm_engine.types import Bools, Floats
@@ -34,7 +33,6 @@ STRETCHES = (0.5, 0.67, 0.8, 1.0, 1.25, 1.5, 2.0)
 ANY_SCALE = (1e-4, 1e4)
 MIRRORED_SHARE = 0.5  # of the residuals as measured: a bend by chance agrees with the mirror image less often
 LOSS_SCALE = 2.0
-SINGULAR = 1e-10  # eigenvalue of a matrix of unit diagonal that is rounding
 MIN_EXTENT_SIGMAS = 3.0  # of the positions' spread, below which they show no direction
 
 
@@ -276,29 +274,6 @@ def _why_not(
         reason=f"only {int(inlier.sum())} of {len(a)} positions agree with the shape of the trajectory (are latitude "
         "and longitude swapped, or the receiver's clock off?)"
     )
-
-
-def clock_offset(antenna_m: Floats, positions: ReceiverPositions) -> tuple[float, float] | None:
-    """Seconds by which measured positions are ahead of aligned ones (n, 3), and the standard deviation of that.
-
-    A clock that is off moves every position along the track by speed times offset. Where the speed or the direction
-    changes, this cannot be mistaken for a shift or a turn of the whole track; else the standard deviation is large.
-    None with fewer than 5 positions.
-    """
-    if len(antenna_m) < 5:
-        return None
-    velocity = np.gradient(antenna_m, positions.time_s, axis=0)[:, :, None]
-    off_m = (positions.position_m - antenna_m)[:, :, None]
-    turns = rigid_motions(antenna_m - antenna_m.mean(0))[:, :, [0, 1, 2, 5]]
-    known = positions.information(np.concatenate([velocity, turns, off_m], axis=2))
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[:-1], 1e-12))
-    matrix, right = known[:-1, :-1] * np.outer(scale, scale), known[:-1, -1] * scale
-    if np.linalg.eigvalsh(matrix)[0] < SINGULAR:
-        return None
-    solution = np.linalg.solve(matrix, right)
-    noise = max(1.0, float(known[-1, -1] - right @ solution) / off_m.size)
-    sigma_s = float(np.sqrt(noise * np.linalg.inv(matrix)[0, 0]) * scale[0])
-    return float(solution[0] * scale[0]), sigma_s
 
 
 def rigid_motions(place_m: Floats) -> Floats:

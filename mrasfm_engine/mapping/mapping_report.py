@@ -248,6 +248,9 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             "scale_of_rig_against_gnss": placement.scale_of_rig,
             "error_jumps_at_us": [int(t) for t in mapper.drive.timestamps_us[placement.jumps]],
         }
+        if placement.clock is not None:
+            clock = {"clock_offset_s": placement.clock.offset_s, "sigma_clock_offset_s": placement.clock.sigma_s}
+            result["gnss"] |= clock
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}
     return result

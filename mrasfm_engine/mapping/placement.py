@@ -24,12 +24,14 @@ from mrasfm_engine.mapping.georeferencing import (
     similarity_motions,
 )
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.receiver_findings import SCALE_DISAGREEMENT_SIGMAS, clock_findings, rig_scale_findings
+from mrasfm_engine.mapping.receiver_clock import ReceiverClock, clock_findings, clock_offset
+from mrasfm_engine.mapping.receiver_findings import SCALE_DISAGREEMENT_SIGMAS, rig_scale_findings
 from mrasfm_engine.mapping.receiver_fit import (
     MIN_POSITIONS,
     Placement,
     ReceiverErrors,
     antenna_places_m,
+    clock_moves_m,
     most_likely_errors,
     receiver_errors,
     with_jumps,
@@ -62,6 +64,7 @@ def place_by_gnss(
     sigma_scale: float = 0.0,
     rig_may_be_wrong: bool = False,
     thorough: bool = False,
+    clock: ReceiverClock | None = None,
 ) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
@@ -113,11 +116,11 @@ def place_by_gnss(
         interval_us=gnss.interval_us,
         noise_factor=alignment.noise_factor,
         track=gnss if mapper.config.bundle_adjustment.reassessment else None,
+        clock=clock,
     )
     placement = with_prior(mapper, placement, thorough=thorough)
     if not single:
         placement = replace(placement, scale_of_rig=_scale_by_positions(mapper, placement))
-        placement.findings = clock_findings(mapper, placement)
     return placement
 
 
@@ -274,6 +277,7 @@ def _as_term(mapper: Mapper, placement: Placement, units: Ints, errors: Receiver
         wander_time_s=settings.wander_time_s,
         least_spacing_s=max(settings.correlation_time_s, settings.wander_time_s / KNOTS),
         segment=segment,
+        clock_m=clock_moves_m(mapper, placement, units),
     )
 
 
@@ -367,14 +371,42 @@ def _scale_by_positions(mapper: Mapper, placement: Placement) -> float:
 def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
     """Say by the refined scene what positions make of the rig's lengths as given, and find where they contradict it.
 
-    While cameras were where they were given, the scene had another scale by whatever was wrong of them: a rotation or
-    the times of their images as much as a baseline. An adjustment puts that where images show it.
+    The receiver's clock, which would explain another length, is a finding of its own. While cameras were where they
+    were given, the scene had another scale by whatever was wrong of them: a rotation or the times of their images as
+    much as a baseline. An adjustment puts that where images show it.
     """
-    if placement.prior is None or mapper.drive.has_single_camera:
+    if placement.prior is None:
+        return placement
+    placement = replace(placement, findings=[*placement.findings, *clock_findings(placement.clock)])
+    if mapper.drive.has_single_camera:
         return placement
     scale = (1.0 + _growth_by_term(mapper, placement)) / scale_of_baselines(mapper)[0]
     placement = replace(placement, scale_of_rig=float(scale))
     return replace(placement, findings=[*placement.findings, *rig_scale_findings(mapper, placement)])
+
+
+def find_clock(mapper: Mapper, placement: Placement) -> ReceiverClock | None:
+    """The receiver's clock, as positions with a prior show it; None where nothing tells it.
+
+    What a clock does must not pass for an error that wanders: sizes of errors are those that are most likely if it may
+    be off.
+    """
+    if not mapper.config.bundle_adjustment.reassessment:
+        return None
+    before_s = 0.0 if placement.clock is None else placement.clock.offset_s
+    if placement.clock is None:
+        unknown = ReceiverClock(offset_s=0.0, sigma_s=np.inf)
+        placement = with_prior(mapper, replace(placement, clock=unknown), thorough=True)
+    positions = placement.prior
+    assert positions is not None
+    of_rig, sigma_rig = scale_of_baselines(mapper)
+    found = clock_offset(
+        antenna_places_m(mapper, positions.unit, positions.lever_arm_m),
+        positions,
+        factor=1.0 / of_rig,
+        sigma_factor=np.inf if mapper.drive.has_single_camera else sigma_rig,
+    )
+    return None if found is None else replace(found, offset_s=before_s + found.offset_s)
 
 
 def _growth_by_term(mapper: Mapper, placement: Placement) -> float:

@@ -1,4 +1,4 @@
-"""Findings on a receiver: why it is not used, jumps of its error, its clock, and a rig whose scale it contradicts.
+"""Findings on a receiver: why it is not used, jumps of its error, and a rig whose scale it contradicts.
 
 Rough poses may contradict that, too.
 """
@@ -8,15 +8,13 @@ from __future__ import annotations
 import numpy as np
 
 from mrasfm_engine.mapping.calibration import scale_of_baselines
-from mrasfm_engine.mapping.georeferencing import clock_offset, rigid_motions
+from mrasfm_engine.mapping.georeferencing import rigid_motions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.receiver_fit import Placement, antenna_places_m
 from mrasfm_engine.mapping.receiver_jumps import AROUND
 from mrasfm_engine.types import Floats
 from schemas.findings import Finding, error, warning
 
-MIN_CLOCK_OFFSET_S = 0.05
-CLOCK_OFFSET_SIGMAS = 5.0
 MAX_SCALE_DISAGREEMENT = 0.05  # rigs are better known, whatever the default prior says; and as many of the receiver's
 SCALE_DISAGREEMENT_SIGMAS = 3.0
 
@@ -81,26 +79,6 @@ def _step_m(off_m: Floats, k: int) -> float:
     """Distance between the residuals (n, 3) before sample k and those from it on."""
     before, after = off_m[max(0, k - AROUND) : k], off_m[k : k + AROUND]
     return float(np.linalg.norm(np.median(after, axis=0) - np.median(before, axis=0))) if 0 < k < len(off_m) else 0.0
-
-
-def clock_findings(mapper: Mapper, placement: Placement) -> list[Finding]:
-    """The finding that a receiver's clock is clearly off the images'."""
-    positions = placement.prior
-    assert positions is not None
-    antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
-    scale = placement.scale_of_rig * scale_of_baselines(mapper)[0]
-    offset = clock_offset(antenna_m.mean(0) + scale * (antenna_m - antenna_m.mean(0)), positions)
-    if offset is None or abs(offset[0]) <= max(MIN_CLOCK_OFFSET_S, CLOCK_OFFSET_SIGMAS * offset[1]):
-        return []
-    direction = "ahead of" if offset[0] > 0 else "behind"
-    return [
-        warning(
-            "gnss-clock-offset",
-            f"by the shape of the way, gnss.samples are {abs(offset[0]):.2f} s {direction} the images "
-            f"(sigma {offset[1]:.2f} s)",
-            "Check that both have the same clock and time scale (GPS is 18 s ahead of UTC).",
-        )
-    ]
 
 
 def rig_scale_findings(mapper: Mapper, placement: Placement) -> list[Finding]:

@@ -15,6 +15,7 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.mapping.georeferencing import BENT, MOST, GnssAlignment, assess_residuals, similarity_motions
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.receiver_clock import SIGMA_OF_WRONG_CLOCK_S, ReceiverClock
 from mrasfm_engine.mapping.receiver_jumps import find_jumps, segment_of
 from mrasfm_engine.types import Bools, Floats, Ints
 from schemas.findings import Finding
@@ -73,6 +74,7 @@ class Placement:
     off_m: Floats = field(default_factory=lambda: np.zeros((0, 3)))  # (n, 3) scene minus measured, as assessed last
     interval_us: float = 0.0  # of the receiver's samples
     track: GnssTrack | None = None  # the receiver's, where jumps of its error are looked for
+    clock: ReceiverClock | None = None  # at which the track has its times; None where it is taken to be right
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     jumps: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (k,) units from which on it is another
@@ -261,6 +263,7 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
         knots_s=time_of_process_s(time_s, segment, wander_time_s),
         wander_time_s=wander_time_s,
         segment=segment,
+        clock_m=clock_moves_m(mapper, placement, units),
     )
     least, most = np.log([MIN_WHITE, MIN_WHITE]), np.log([np.inf, placement.noise_factor])
 
@@ -299,6 +302,14 @@ def _units_a_sample(mapper: Mapper, units: Ints, interval_us: float) -> int:
     if len(units) < MIN_POSITIONS:
         return 1
     return max(1, round(interval_us / float(np.median(np.diff(mapper.drive.timestamps_us[units])))))
+
+
+def clock_moves_m(mapper: Mapper, placement: Placement, units: Ints) -> Floats | None:
+    """Ways (n, 3) that positions at some units move if a clock is ahead by a sigma; None where it is right."""
+    if placement.clock is None:
+        return None
+    result: Floats = SIGMA_OF_WRONG_CLOCK_S * mapper.motion.velocity_mps(mapper.state, mapper.registered)[units]
+    return result
 
 
 def antenna_places_m(mapper: Mapper, units: Ints, lever_arm_m: Floats) -> Floats:

@@ -58,6 +58,17 @@ def jumping(term: ReceiverPositions, first: int) -> ReceiverPositions:
     return replace(term, segment=segment, knots_s=time_of_process_s(term.time_s, segment, WANDER_TIME_S))
 
 
+def with_clock(term: ReceiverPositions, state: State) -> ReceiverPositions:
+    """The term of a receiver whose clock is known to 0.3 s."""
+    return replace(term, clock_m=0.3 * np.gradient(state.unit_position_m, term.time_s, axis=0))
+
+
+def whole_covariance(term: ReceiverPositions) -> np.ndarray:
+    """Covariance (3 n, 3 n) of the errors along x, then y, then z, with that of the clock."""
+    result: np.ndarray = scipy.linalg.block_diag(*covariances(term))
+    return result if term.clock_m is None else result + np.outer(term.clock_m.T.ravel(), term.clock_m.T.ravel())
+
+
 def covariances(term: ReceiverPositions) -> list[np.ndarray]:
     """Covariance (n, n) of the errors along each axis, as it is defined."""
     alike = np.exp(-np.abs(term.time_s[:, None] - term.time_s) / WANDER_TIME_S)
@@ -130,29 +141,70 @@ def test_knots_of_samples_begin_anew_at_a_jump() -> None:
     assert some.segment.tolist() == [0, 0, 1, 1, 1]
 
 
+def test_a_clock_costs_what_the_error_costs_that_it_makes_of_all_positions() -> None:
+    rng = np.random.default_rng(0)
+    state = moving(rng)
+    term = with_clock(received(state, rng, loss_scale=1e6), state)
+    for late_s in (0.0, 0.6):
+        late = replace(term, position_m=term.position_m - late_s / 0.3 * term.clock_m)
+        off_m = (state.unit_position_m + state.unit_rotation @ ARM_M - late.position_m).T.ravel()
+        expected = 0.5 * off_m @ np.linalg.solve(whole_covariance(late), off_m)
+        assert late.cost(state) == pytest.approx(expected, rel=1e-9)
+    assert late.cost(state) < replace(late, clock_m=None).cost(state) - 1.0
+    shared = whole_covariance(late) - np.diag(late.sigma_m.T.ravel() ** 2)
+    seen_m = -(shared @ np.linalg.solve(whole_covariance(late), off_m)).reshape(3, -1).T
+    np.testing.assert_allclose(late.errors_m(state), seen_m, atol=1e-6)
+
+
+def test_likelihood_with_a_clock_is_that_of_its_covariance() -> None:
+    rng = np.random.default_rng(6)
+    state = moving(rng)
+    term = with_clock(received(state, rng), state)
+    off_m = state.unit_position_m + state.unit_rotation @ ARM_M - term.position_m
+    moves = np.tile(np.eye(3), (UNITS, 1, 1))
+
+    def log_likelihood(of: ReceiverPositions) -> float:
+        inverse, x = np.linalg.inv(whole_covariance(of)), np.swapaxes(moves, 0, 1).reshape(-1, 3)
+        known = x.T @ inverse @ x
+        left = inverse - inverse @ x @ np.linalg.solve(known, x.T @ inverse)
+        flat = off_m.T.ravel()
+        return -0.5 * float(flat @ left @ flat - np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(known)[1])
+
+    other = replace(term, sigma_m=2.0 * term.sigma_m, wander_m=0.5 * term.wander_m)
+    found = [one.restricted_log_likelihood(off_m, moves) for one in (term, other)]
+    assert found[1] - found[0] == pytest.approx(log_likelihood(other) - log_likelihood(term), rel=1e-8)
+    known = np.linalg.inv(whole_covariance(term))
+    x = np.swapaxes(moves, 0, 1).reshape(-1, 3)
+    np.testing.assert_allclose(term.information(moves), x.T @ known @ x, rtol=1e-8, atol=1e-8)
+
+
 @pytest.mark.parametrize("jump", [False, True])
+@pytest.mark.parametrize("clock", [False, True])
 @pytest.mark.parametrize("fixed", [None, 4])
-def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, jump: bool) -> None:
+def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, clock: bool, jump: bool) -> None:
     rng = np.random.default_rng(1)
     state, layout = moving(rng), free_units(fixed)
     term = received(state, rng, loss_scale=1e6)
     term = jumping(term, 5) if jump else term
+    term = with_clock(term, state) if clock else term
     extra = Extra.none(layout)
     term.add_to(state, layout, extra)
     units = np.flatnonzero(layout.unit_slot >= 0)
-    expected = np.zeros((layout.size, layout.size))
-    for a, covariance in enumerate(covariances(term)):
+    jacobian = np.zeros((3, UNITS, layout.size))
+    for a in range(3):
         rows = [np.concatenate([-se3.skew(state.unit_rotation[u] @ ARM_M), np.eye(3)], 1)[a] for u in units]
-        jacobian = np.zeros((UNITS, layout.size))
-        jacobian[units] = scipy.linalg.block_diag(*rows)
-        expected += jacobian.T @ np.linalg.solve(covariance, jacobian)
+        jacobian[a, units] = scipy.linalg.block_diag(*rows)
+    jacobian = jacobian.reshape(-1, layout.size)
+    expected = jacobian.T @ np.linalg.solve(whole_covariance(term), jacobian)
     np.testing.assert_allclose(extra.matrix, expected, atol=1e-8 * np.abs(expected).max())
 
 
-def test_gradient_is_that_of_the_cost() -> None:
+@pytest.mark.parametrize("clock", [False, True])
+def test_gradient_is_that_of_the_cost(clock: bool) -> None:
     rng = np.random.default_rng(2)
     state, layout = moving(rng), free_units()
     term = received(state, rng)
+    term = with_clock(term, state) if clock else term
     term.position_m[3] += [5.0, -3.0, 2.0]
     extra = Extra.none(layout)
     term.add_to(state, layout, extra)
@@ -241,18 +293,23 @@ def test_clusters_of_samples_share_what_knots_leave_out() -> None:
     assert 0.97 < (1.0 / float(term.information(columns)[0, 0])) / exact < 30.0
 
 
+@pytest.mark.parametrize("clock", [False, True])
 @pytest.mark.parametrize("knots", [1, 5, UNITS])
-def test_the_best_states_solve_the_system_of_their_weights(knots: int) -> None:
+def test_the_best_states_solve_the_system_of_their_weights(knots: int, clock: bool) -> None:
     rng = np.random.default_rng(7)
     state = moving(rng)
     term = received(state, rng, knots_s=np.linspace(0.0, 2.0 * (UNITS - 1), knots), loss_scale=2.0)
+    term = with_clock(term, state) if clock else term
     whitened = term._whitened(state)[1]
-    states, residuals, weights = term._best(whitened)
+    states, of_clock, residuals, weights = term._best(whitened)
+    assert (abs(of_clock) > 0.01) is clock
     assert 0.0 < weights.min() < 0.9
-    np.testing.assert_allclose(residuals, whitened - term._at_samples(states), atol=1e-12)
+    np.testing.assert_allclose(residuals, whitened - term._at_samples(states, of_clock), atol=1e-12)
     np.testing.assert_allclose(weights, 1.0 / (1.0 + (residuals**2).sum(1) / 4.0), atol=1e-6)
+    without = whitened - of_clock * term._clock
     for axis in range(3):
         off, diagonal = term._by_knots(weights, axis)
         matrix = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
-        right = term._at_knots((weights * whitened[:, axis])[:, None], axis)[:, 0]
+        right = term._at_knots((weights * without[:, axis])[:, None], axis)[:, 0]
         np.testing.assert_allclose(matrix @ states[:, axis], right, rtol=1e-5, atol=1e-5)
+    assert of_clock == pytest.approx(float((weights[:, None] * term._clock * residuals).sum()), rel=1e-4, abs=1e-6)

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.mapping.georeferencing import GnssAlignment, Refusal, align_with_gnss, assess_residuals, clock_offset
+from mrasfm_engine.mapping.georeferencing import GnssAlignment, Refusal, align_with_gnss, assess_residuals
 from mrasfm_engine.synthetic.simulate import simulate_trajectory
 
 ARM_M = np.array([-0.5, 0.2, 1.8])
@@ -232,46 +231,3 @@ def test_too_few_positions_are_a_reason(units: int) -> None:
     found = cut.align()
     assert isinstance(found, Refusal)
     assert f"only {units} registered" in found.reason
-
-
-def driven(times_s: np.ndarray) -> np.ndarray:
-    """A bend at changing speed."""
-    way = 8.0 * times_s + 10.0 * np.sin(0.5 * times_s)
-    return np.stack([60 * np.sin(way / 60), 60 * (1 - np.cos(way / 60)), 0 * way], 1)
-
-
-def measured(position_m: np.ndarray, times_s: np.ndarray, *, white_m: float, wander_m: float) -> ReceiverPositions:
-    return ReceiverPositions.from_samples(
-        unit=np.arange(len(times_s)),
-        time_s=times_s,
-        position_m=position_m,
-        white_m=np.full((len(times_s), 3), white_m),
-        wander_m=np.full((len(times_s), 3), wander_m),
-        lever_arm_m=np.zeros(3),
-        wander_time_s=60.0,
-        least_spacing_s=1.0,
-    )
-
-
-@pytest.mark.parametrize("offset_s", [-0.4, 0.0, 0.15])
-def test_a_clock_that_is_off_is_told_with_its_sign(offset_s: float) -> None:
-    times_s = np.arange(80) * 0.2
-    noise = np.random.default_rng(0).normal(size=(80, 3)) * 0.05
-    sigma_s = []
-    for wander_m in (0.0, 0.3):
-        positions = measured(driven(times_s + offset_s) + noise, times_s, white_m=0.05, wander_m=wander_m)
-        found = clock_offset(driven(times_s), positions)
-        assert found is not None
-        assert found[0] == pytest.approx(offset_s, abs=max(0.02, 0.1 * abs(offset_s)))
-        sigma_s.append(found[1])
-    assert 1e-4 < sigma_s[0] < 0.05
-    assert 1.5 * sigma_s[0] < sigma_s[1] < 0.2  # a receiver that wanders knows it less well
-
-
-def test_a_clock_cannot_be_told_on_a_straight_way_at_one_speed() -> None:
-    times_s = np.arange(40) * 0.2
-    way = times_s[:, None] * np.array([10.0, 0.0, 0.0])
-    noise = np.random.default_rng(0).normal(size=(40, 3)) * 0.05
-    found = clock_offset(way, measured(way + noise, times_s, white_m=0.05, wander_m=0.0))
-    assert found is None or found[1] > 1.0
-    assert clock_offset(way[:4], measured(way[:4], times_s[:4], white_m=1.0, wander_m=0.0)) is None
