@@ -7,8 +7,10 @@ from collections.abc import Collection, Iterator
 
 MANIFEST_NAME = "drive.json"
 TRUTH_NAME = "truth.tum"  # true poses, beside the manifest
-_TRUTH = frozenset(
+UPLOAD_RECORD_NAME = ".mrasfm-upload.json"  # state of an upload of the drive, beside the manifest
+_BESIDE_MANIFEST = frozenset(
     {
+        UPLOAD_RECORD_NAME,
         TRUTH_NAME,
         "truth_calibration.json",
         "truth_cameras.json",
@@ -16,7 +18,7 @@ _TRUTH = frozenset(
         "truth_own_car",
         "truth_world.json",
     }
-)  # files and folders beside the manifest of a drive that was imported or rendered
+)  # files and folders that imports, renderings and uploads leave in a drive's folder
 
 _LEFT_BY_SYSTEMS = frozenset({".DS_Store", "Thumbs.db", "desktop.ini"})
 _FOLDER_OF_MACOS = "__MACOSX"
@@ -28,9 +30,9 @@ def is_ignored(path: str) -> bool:
     return _FOLDER_OF_MACOS in parts or parts[-1] in _LEFT_BY_SYSTEMS or parts[-1].startswith("._")
 
 
-def is_truth(path: str) -> bool:
-    """Return whether a path in a drive's folder is one of the true values that imports and renderings write there."""
-    return path.partition("/")[0] in _TRUTH
+def is_beside_manifest(path: str) -> bool:
+    """Return whether a path in a drive's folder is a true value of an import or rendering, or an upload's record."""
+    return path.partition("/")[0] in _BESIDE_MANIFEST
 
 
 def composed(path: str) -> str:

@@ -13,7 +13,7 @@ from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
 from mrasfm_engine.preflight.drive_check import check_drive, require_sound
 from mrasfm_engine.scene.drive import Drive
 from schemas import DriveManifest, parse_manifest, parse_new_manifest
-from schemas.file_names import MANIFEST_NAME, is_ignored, is_truth
+from schemas.file_names import MANIFEST_NAME, is_beside_manifest, is_ignored
 from schemas.findings import Finding, Severity
 
 __all__ = [
@@ -61,9 +61,9 @@ def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
 
 
 def foreign_file(folder: Path) -> Path | None:
-    """The first file or folder in a drive's folder that no import and no rendering makes; None where there is none."""
+    """The first file or folder in a drive's folder that no import, rendering or upload makes; None if there is none."""
     made = (MANIFEST_NAME, "images", "masks")
-    others = (path for path in folder.iterdir() if not is_truth(path.name) and not is_ignored(path.name))
+    others = (path for path in folder.iterdir() if not is_beside_manifest(path.name) and not is_ignored(path.name))
     return min((path for path in others if path.name not in made), default=None)
 
 

@@ -19,10 +19,10 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, StringConstraints, ValidationError
 
+from schemas.file_names import UPLOAD_RECORD_NAME
 from service.client.drive_folder import DriveFolder
 from service.storage.data_folder import write_private_file
 
-STATE_NAME = ".mrasfm-upload.json"
 _RequestName = Annotated[str, StringConstraints(pattern=r"^[0-9a-f-]{36}$")]
 _DriveId = Annotated[str, StringConstraints(pattern=r"^drv_[0-9a-f]{1,40}$")]
 _JobId = Annotated[str, StringConstraints(pattern=r"^job_[0-9a-f]{1,40}$")]
@@ -70,7 +70,7 @@ class UploadState:
 
     def __init__(self, folder: DriveFolder, url: str) -> None:
         self._name = f"{url} {folder.manifest_sha256}"
-        self._places = [folder.root / STATE_NAME, _cache_of(folder.root)]
+        self._places = [folder.root / UPLOAD_RECORD_NAME, _cache_of(folder.root)]
         self._lock = threading.Lock()
         self._document = next((found for place in self._places if (found := _read(place)) is not None), _Document())
         self.record = self._document.uploads.get(self._name) or _new_record()

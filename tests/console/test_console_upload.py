@@ -294,6 +294,7 @@ def test_archives_are_uploaded_once(open_console: Open, world: World, tmp_path: 
     client = world.api.client()
     log_in(page, world.api.url, client.key)
     beside = {"my drive__.DS_Store": b"litter", "my drive__truth.tum": b"0 0 0 0 0 0 0 1"}
+    beside["my drive__.mrasfm-upload.json"] = b"{}"
     for number, suffix in enumerate((".zip", ".tar", ".tar.gz"), 1):
         drive = tiny_drive(f"as {suffix}", seed=f"as {suffix}")
         path = archive_of(drive, tmp_path / f"drive{suffix}", **beside)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 
-from schemas.file_names import MANIFEST_NAME, composed, is_truth, portable_key
+from schemas.file_names import MANIFEST_NAME, composed, is_beside_manifest, portable_key
 from service.errors import EmptyArchive, ServiceError, UnexpectedFile, UnsafeArchive
 from service.storage.uploads.archive_errors import shown
 
@@ -76,10 +76,12 @@ class EntryNames:
             remedy = "Make the archive again with each file once, under names that differ in more than case."
             raise UnsafeArchive(f"entry {shown(name)} is in the archive {how}", remedy=remedy)
         self._names.append(name)
-        return self._file(name) is not None or (not is_truth(name) and self._file(without_top(name)) is not None)
+        return self._file(name) is not None or (
+            not is_beside_manifest(name) and self._file(without_top(name)) is not None
+        )
 
     def resolve(self) -> dict[str, str]:
-        """The drive's file for each name that was added and is one: true poses beside the manifest are none.
+        """The drive's file for each name that was added and is one: what imports, renderings and uploads leave is none.
 
         Raises
         ------
@@ -88,7 +90,7 @@ class EntryNames:
         """
         paths = self._paths()
         files = {name: file for name, path in paths.items() if (file := self._file(path)) is not None}
-        strange = [name for name, path in paths.items() if name not in files and not is_truth(path)]
+        strange = [name for name, path in paths.items() if name not in files and not is_beside_manifest(path)]
         if strange:
             raise unexpected_files(strange, len(self._exact))
         if not files:
@@ -110,7 +112,7 @@ class EntryNames:
 
     def _has_common_top(self) -> bool:
         tops = {name.partition("/")[0] for name in self._names}
-        return len(tops) == 1 and all("/" in name and not is_truth(name) for name in self._names)
+        return len(tops) == 1 and all("/" in name and not is_beside_manifest(name) for name in self._names)
 
 
 def may_be_manifest(name: str) -> bool:

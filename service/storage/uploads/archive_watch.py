@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO, Protocol, TypeAlias
 
-from schemas.file_names import is_ignored, is_truth
+from schemas.file_names import is_beside_manifest, is_ignored
 from service.storage.uploads.archive_limits import SMALL_BYTES, require_ratio
 from service.storage.uploads.archive_names import safe_name, unexpected_files, without_top
 from service.storage.uploads.decompress import MAX_XZ_MEMORY_BYTES, compression_of
@@ -126,7 +126,9 @@ class ArchiveWatch:
         asked = {option for name in names for option in (name, without_top(name)) if option}
         known = self._known(sorted(asked)) if asked else ()
         strange = [
-            name for name in names if not any(path in known or is_truth(path) for path in (name, without_top(name)))
+            name
+            for name in names
+            if not any(path in known or is_beside_manifest(path) for path in (name, without_top(name)))
         ]
         if strange:
             raise unexpected_files(strange, self._files_expected, is_whole=False)

@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
+from schemas.file_names import UPLOAD_RECORD_NAME
 from service.client import ApiError, ClientError, DriveFolder, UploadState, resumable, upload_drive
 from service.client.drive_folder import LocalFile, identify
 from service.client.parallel import Meter, no_report
 from service.client.resumable import ResumableUpload
-from service.client.upload_state import STATE_NAME
 from service.database.tables import Drive
 from service.storage.uploads.resumable import PartialFile
 from tests.helpers.bad_network import Cut, bad_network
@@ -42,7 +42,7 @@ def large_drive(tmp_path: Path) -> Path:
 
 
 def state_of(drive: Path) -> dict[str, Any]:
-    (upload,) = json.loads((drive / STATE_NAME).read_text())["uploads"].values()
+    (upload,) = json.loads((drive / UPLOAD_RECORD_NAME).read_text())["uploads"].values()
     return dict(upload)
 
 

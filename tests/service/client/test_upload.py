@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 from schemas.api.jobs import ReconstructionSettings
+from schemas.file_names import UPLOAD_RECORD_NAME
 from service.client import (
     ApiError,
     ClientError,
@@ -32,7 +33,6 @@ from service.client import Client as LibraryClient
 from service.client.drive_folder import identify
 from service.client.parallel import in_parallel
 from service.client.transport import Transport
-from service.client.upload_state import STATE_NAME
 from tests.helpers.bad_network import Cut, Recorder, bad_network
 from tests.helpers.live_api import DEADLINE_S, Client, free_port, wait_until
 from tests.helpers.tiny_drive import png, tiny_drive
@@ -91,7 +91,7 @@ def test_contents_that_the_project_has_are_not_sent(
     library = connect(client)
     first = upload_drive(library, DriveFolder.read(drive))
     copy = tmp_path / "copy"
-    shutil.copytree(drive, copy, ignore=shutil.ignore_patterns(STATE_NAME))
+    shutil.copytree(drive, copy, ignore=shutil.ignore_patterns(UPLOAD_RECORD_NAME))
     second = upload_drive(library, DriveFolder.read(copy))
     assert second.drive_id != first.drive_id
     assert (second.files_sent, second.bytes_sent, second.files_skipped) == (0, 0, 6)
@@ -298,7 +298,7 @@ def test_what_is_kept_goes_elsewhere_where_the_folder_is_not_writable(
     client: Client, connect: Connect, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (drive / STATE_NAME).mkdir()  # no file can be put in its place, also not by root
+    (drive / UPLOAD_RECORD_NAME).mkdir()  # no file can be put in its place, also not by root
     library, folder = connect(client), DriveFolder.read(drive)
     first = upload_drive(library, folder)
     assert len(list((tmp_path / "cache" / "mrasfm" / "uploads").iterdir())) == 1
@@ -328,7 +328,7 @@ def test_no_address_in_the_folder_is_given_the_key(
         "resumable": {f"{file.path} {file.sha256}": target for file in files},
     }
     record = {"version": 1, "uploads": {f"{library.url} {folder.manifest_sha256}": planted}}
-    (folder.root / STATE_NAME).write_text(json.dumps(record))
+    (folder.root / UPLOAD_RECORD_NAME).write_text(json.dumps(record))
     sent = upload_drive(library, folder)
     assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
     assert stranger.requests == []
@@ -358,7 +358,7 @@ def test_a_redirect_is_told_and_not_followed(stranger: Recorder) -> None:
 def test_a_damaged_record_costs_nothing_but_a_new_drive(
     client: Client, connect: Connect, drive: Path, kept: bytes
 ) -> None:
-    (drive / STATE_NAME).write_bytes(kept)
+    (drive / UPLOAD_RECORD_NAME).write_bytes(kept)
     sent = upload_drive(connect(client), DriveFolder.read(drive))
-    record = json.loads((drive / STATE_NAME).read_bytes())["uploads"]
+    record = json.loads((drive / UPLOAD_RECORD_NAME).read_bytes())["uploads"]
     assert [upload["drive_id"] for upload in record.values()] == [sent.drive_id]

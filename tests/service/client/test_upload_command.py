@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from schemas.file_names import UPLOAD_RECORD_NAME
 from service.api.context import Context
-from service.client.upload_state import STATE_NAME
 from service.domain import jobs
 from tests.helpers.bad_network import Cut, bad_network
 from tests.helpers.live_api import (
@@ -229,7 +229,7 @@ def test_missing_files_are_listed_before_anything_is_sent(drive: Path) -> None:
     assert "  front/000001.png" in told
     assert "Nothing was sent." in told
     assert summary["drive_id"] is None
-    assert not (drive / STATE_NAME).exists()
+    assert not (drive / UPLOAD_RECORD_NAME).exists()
 
 
 def test_a_wrong_key_says_what_to_do(client: Client, drive: Path, tmp_path: Path) -> None:

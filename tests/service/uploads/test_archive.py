@@ -237,10 +237,10 @@ def test_files_that_are_not_in_the_manifest(unpacked: Unpacker, pack: Pack) -> N
 
 
 @pytest.mark.parametrize("top", ["", "my drive/"])
-def test_the_truth_beside_the_manifest_is_ignored(unpacked: Unpacker, pack: Pack, top: str) -> None:
-    """As `mrasfm import` and `mrasfm synth` leave it in a drive's folder."""
-    truth = ("truth.tum", "truth_world.json", "truth_moving/front/0.png")
-    members = [(top + name, b"0 0 0 0 0 0 0 1") for name in truth]
+def test_what_our_commands_leave_beside_the_manifest_is_ignored(unpacked: Unpacker, pack: Pack, top: str) -> None:
+    """As `mrasfm import`, `mrasfm synth` and `mrasfm upload` leave it in a drive's folder."""
+    left = ("truth.tum", "truth_world.json", "truth_moving/front/0.png", ".mrasfm-upload.json")
+    members = [(top + name, b"0 0 0 0 0 0 0 1") for name in left]
     assert list(unpacked(pack([*members, (f"{top}front/0.png", png())]))) == ["front/0.png"]
     unpacked.refused(
         pack([*members, (f"{top}front/truth.tum", b"1"), (f"{top}front/0.png", png())]),

@@ -88,6 +88,7 @@ def ahead_of(kind: str) -> int:
 @pytest.mark.parametrize("prefix", ["", "my drive/"])
 def test_what_belongs_to_the_drive_is_not_refused(tmp_path: Path, pack: Pack, prefix: str) -> None:
     names = [*EXPECTED, "drive.json", ".DS_Store", "__MACOSX/._x", "truth.tum", "truth_own_car/front.png"]
+    names.append(".mrasfm-upload.json")
     data = pack(images(*(prefix + name for name in names)))
     assert received(tmp_path / "archive", data) == len(data)
 

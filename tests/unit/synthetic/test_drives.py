@@ -28,6 +28,7 @@ from mrasfm_engine.synthetic.own_car import UNLABELLED
 from mrasfm_engine.synthetic.rigs import TrueCamera, mounts, true_cameras
 from mrasfm_engine.synthetic.streets import lay_out
 from schemas import DriveManifest, Pose, SemanticClass
+from schemas.file_names import UPLOAD_RECORD_NAME
 from tests.helpers.painted_once import textures_painted_once
 from tests.helpers.slow import slow
 
@@ -187,6 +188,7 @@ def test_nothing_is_overwritten_without_force(drive: Path, tmp_path: Path) -> No
     with pytest.raises(InputError, match="not an empty folder"):
         render_drives(options, out)
     (out / "precious.txt").unlink()
+    (out / UPLOAD_RECORD_NAME).write_text("{}")  # the drive was uploaded
     assert (out / "masks").is_dir()
     render_drives(options, out, force=True)
     assert not (out / "masks").exists()

@@ -12,8 +12,8 @@ const MAGIC: [string, number[]][] = [
 const TAR_MAGIC_AT = 257;
 const SHOWN = 5;
 const LITTER = /(^|\/)(__MACOSX\/|\.DS_Store$|Thumbs\.db$|desktop\.ini$|\._[^/]*$)/;
-// True values that `mrasfm import` and `mrasfm synth` write beside the manifest: not sent, as nothing reads them there.
-const TRUTH = /^truth(\.tum|_calibration\.json|_cameras\.json|_moving|_own_car|_world\.json)(\/|$)/;
+// What `mrasfm import`, `mrasfm synth` and `mrasfm upload` leave beside the manifest: not sent, as nothing reads it there.
+const BESIDE = /^(\.mrasfm-upload\.json$|truth(\.tum|_calibration\.json|_cameras\.json|_moving|_own_car|_world\.json)(\/|$))/;
 
 export function refuse(detail: string, remedy: string): ProblemError {
   return new ProblemError({ title: "The archive is refused, nothing was sent", detail, remedy }, 0);
@@ -117,7 +117,7 @@ function inOrder(members: ReadonlyMap<string, Member>, again: () => AsyncGenerat
 
 /** Refuse files that are not the drive's, by name. */
 export function requireExpected(folder: Folder, named: ReadonlySet<string>): void {
-  const strange = [...folder.sizes.keys()].filter((path) => path !== MANIFEST && !named.has(path) && !TRUTH.test(path));
+  const strange = [...folder.sizes.keys()].filter((path) => path !== MANIFEST && !named.has(path) && !BESIDE.test(path));
   if (folder.what !== "archive" || strange.length === 0) return;
   const more = strange.length > SHOWN ? ` and ${strange.length - SHOWN} more` : "";
   throw refuse(
