@@ -6,6 +6,7 @@ Everything that a client asks may be repeated: GET and PUT by their nature, POST
 from __future__ import annotations
 
 import ipaddress
+import os
 import random
 import socket
 import ssl
@@ -15,7 +16,9 @@ import weakref
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from http import HTTPStatus
+from importlib.util import find_spec
 from typing import Any
+from urllib.request import getproxies, proxy_bypass
 
 import httpx
 from pydantic import ValidationError
@@ -97,7 +100,7 @@ class Transport:
     Raises
     ------
     ClientError
-        Where the URL or the key cannot be one.
+        Where the URL or the key cannot be one, or the environment names a proxy or certificates that cannot be used.
     """
 
     def __init__(
@@ -116,8 +119,8 @@ class Transport:
             timeout=httpx.Timeout(IO_TIMEOUT_S, connect=CONNECT_TIMEOUT_S, pool=None),
             limits=httpx.Limits(max_connections=connections, max_keepalive_connections=connections),
             follow_redirects=False,  # the key is for this service, not for whom it names
-            # A proxy of the environment cannot reach this machine's loopback.
-            trust_env=not is_loopback(httpx.URL(self.url).host),
+            proxy=_proxy_of(httpx.URL(self.url)),
+            trust_env=False,  # httpx would open all proxies of the environment, also those that are not for this URL
         )
 
     def stop(self) -> None:
@@ -322,9 +325,53 @@ def _seconds(retry_after: str | None) -> float | None:
     return float(retry_after) if retry_after is not None and retry_after.strip().isdecimal() else None
 
 
-def _certificates(url: str) -> ssl.SSLContext | bool:
+def _certificates(url: str) -> ssl.SSLContext:
     """Certificates that a server's is verified with; where there is no TLS, none are loaded, which takes 50 ms.
 
     A context without certificates would refuse every server.
+
+    Raises
+    ------
+    ClientError
+        Where those that the environment names cannot be read.
     """
-    return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT) if httpx.URL(url).scheme == "http" else True
+    if httpx.URL(url).scheme == "http":
+        return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    try:
+        return httpx.create_ssl_context()
+    except OSError as error:  # an error of TLS is one
+        named = " or ".join(name for name in ("SSL_CERT_FILE", "SSL_CERT_DIR") if os.environ.get(name))
+        raise ClientError(
+            f"the certificates of {named} cannot be read: {error.strerror or error}. Correct the variable or unset it."
+        ) from error
+
+
+def _proxy_of(url: httpx.URL) -> httpx.Proxy | None:
+    """The proxy that the environment names for a URL; none reaches this machine's loopback.
+
+    Raises
+    ------
+    ClientError
+        Where it cannot be used. The message names the variable and not what it holds: that may be a password.
+    """
+    if is_loopback(url.host) or proxy_bypass(url.netloc.decode("ascii")):
+        return None
+    proxies = getproxies()
+    kind = next((kind for kind in (url.scheme, "all") if proxies.get(kind)), None)
+    if kind is None:
+        return None
+    address = proxies[kind]
+    try:
+        proxy = httpx.Proxy(address if "://" in address else f"http://{address}")
+        if not proxy.url.host:
+            raise ValueError("it names no host")
+    except (ValueError, httpx.InvalidURL):
+        problem, remedy = "is no http://, https:// or socks5:// URL", "Correct it"
+    else:
+        if not proxy.url.scheme.startswith("socks") or find_spec("socksio") is not None:
+            return proxy
+        problem, remedy = "speaks SOCKS, for which the package socksio is missing", "Install it, give an HTTP proxy"
+    raise ClientError(
+        f"the proxy of {kind.upper()}_PROXY {problem}. {remedy}, or name {url.host} in NO_PROXY if it is reached "
+        "without a proxy."
+    )
