@@ -72,6 +72,8 @@ def download(
 def require_free(out: Path, scene_id: str | None) -> None:
     """Refuse a folder that holds something else than this scene; without an id, something else than any scene of ours.
 
+    One that is not there has to be in a folder in which it can be made: jobs take hours.
+
     Raises
     ------
     SceneFolderError
@@ -81,6 +83,7 @@ def require_free(out: Path, scene_id: str | None) -> None:
     except OSError as error:
         raise SceneFolderError(f"{out} cannot be read: {error.strerror}. Give another folder.") from error
     if is_empty:
+        _require_makable(out)
         return
     held = _scene_in(out)
     if held is None:
@@ -91,6 +94,14 @@ def require_free(out: Path, scene_id: str | None) -> None:
         raise SceneFolderError(
             f"{out} holds the {_kind(held)} {held}, not {scene_id}. Give another folder, or remove it."
         )
+
+
+def _require_makable(out: Path) -> None:
+    there = next(path for path in (out, *out.absolute().parents) if path.exists())
+    if not there.is_dir():
+        raise SceneFolderError(f"{out} cannot be made: {there} is a file. Give another folder.")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise SceneFolderError(f"{out} cannot be written: {there} is not yours to write. Give another folder.")
 
 
 def require_free_for_job(out: Path, known_job: Callable[[], JobResource | None]) -> None:

@@ -277,6 +277,27 @@ def test_a_folder_that_is_taken_is_refused_before_the_upload(client: Client, dri
     assert client.get("/v1/drives").json()["items"] == []
 
 
+def test_a_folder_that_cannot_be_made_is_refused_before_the_upload(client: Client, drive: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes").write_text("mine")
+    code, _, told = upload(client, drive, "--out", str(tmp_path / "notes" / "of" / "scene"))
+    assert code == 2
+    assert f"cannot be made: {tmp_path / 'notes'} is a file" in told
+    assert client.get("/v1/drives").json()["items"] == []
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written_is_refused_before_the_upload(
+    client: Client, drive: Path, tmp_path: Path
+) -> None:
+    closed = tmp_path / "closed"
+    closed.mkdir(0o500)
+    for out in (closed, closed / "scene"):
+        code, _, told = upload(client, drive, "--out", str(out))
+        assert code == 2
+        assert f"cannot be written: {closed} is not yours to write" in told
+    assert client.get("/v1/drives").json()["items"] == []
+
+
 def test_a_folder_of_another_scene_is_refused_before_the_upload(client: Client, drive: Path, tmp_path: Path) -> None:
     out = tmp_path / "scene"
     running = Upload(drive, "--out", str(out), url=client.api.url, key=client.key)
