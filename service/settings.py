@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import operator
 import re
-from collections.abc import Callable, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import quote, urlsplit
 
-from pydantic import AfterValidator, Field, SecretStr, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, SecretStr, ValidationError, ValidationInfo, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
-from sqlalchemy import URL
+from sqlalchemy import URL, make_url
+from sqlalchemy.exc import ArgumentError
 
 # Numbers have both bounds: what does not fit the database's integers, or a date, would fail at the first request.
 _MAX_BYTES = 2**60
@@ -41,6 +43,39 @@ def _tile_url(url: str) -> str:
     return url
 
 
+def _database_url(url: SecretStr) -> SecretStr:
+    try:
+        driver = make_url(url.get_secret_value()).drivername
+    except (ArgumentError, ValueError):
+        driver = ""
+    if driver not in ("sqlite", "sqlite+pysqlite", "postgresql", "postgresql+psycopg"):
+        raise ValueError("must be postgresql+psycopg://USER:PASSWORD@HOST/NAME or sqlite:///FILE")
+    return url
+
+
+def _redis_url(url: SecretStr) -> SecretStr:
+    if not _has_scheme(url.get_secret_value(), "redis", "rediss", "redis+socket"):
+        raise ValueError("must be redis://HOST:PORT/0, rediss://HOST:PORT/0 or redis+socket:///PATH")
+    return url
+
+
+def _artifacts_url(url: str) -> str:
+    if not _has_scheme(url, "file", "s3", "s3a", "gs", "az", "azure", "adl", "abfs", "abfss"):
+        raise ValueError("must be file:///FOLDER, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX")
+    return url
+
+
+def _has_scheme(url: str, *schemes: str) -> bool:
+    try:
+        parts = urlsplit(url)
+        return parts.scheme in schemes and parts.port != 0
+    except ValueError:  # a port that is none
+        return False
+
+
+DatabaseUrl = Annotated[SecretStr, AfterValidator(_database_url)]
+RedisUrl = Annotated[SecretStr, AfterValidator(_redis_url)]
+ArtifactsUrl = Annotated[str, AfterValidator(_artifacts_url)]
 Token = Annotated[SecretStr, AfterValidator(_sendable)]
 TileUrl = Annotated[str, AfterValidator(_tile_url)]
 Count = Annotated[int, Field(ge=1, le=10_000_000)]
@@ -69,12 +104,12 @@ class Settings(BaseSettings):
     data_dir: Path = Field(
         Path("mrasfm-data"), description="state of this machine: spool, scratch, and the embedded database and store"
     )
-    database_url: SecretStr | None = Field(None, description="SQLAlchemy's URL; by default SQLite in the data folder")
-    artifacts_url: str | None = Field(
+    database_url: DatabaseUrl | None = Field(None, description="SQLAlchemy's URL; by default SQLite in the data folder")
+    artifacts_url: ArtifactsUrl | None = Field(
         None,
         description="obstore's URL: `file:///...`, `s3://bucket/prefix`, `gs://...`, `az://...`; else the data folder",
     )
-    redis_url: SecretStr | None = Field(
+    redis_url: RedisUrl | None = Field(
         None,
         description="`redis://...`, `rediss://...` or `redis+socket:///...`; `mrasfm standalone` starts its own broker",
     )
@@ -182,6 +217,8 @@ class Settings(BaseSettings):
     idempotency_hours: Hours = Field(24.0, description="answers to an `Idempotency-Key` are kept for this time")
 
     @field_validator(
+        "artifacts_url",
+        "redis_url",
         "metrics_token",
         "submap_workers",
         "console_tiles",
@@ -257,3 +294,27 @@ class Settings(BaseSettings):
     def scratch_dir(self) -> Path:
         """Folder of the attempts' files."""
         return self.data_dir.resolve() / "scratch"
+
+
+def settings_of_command(*, data_dir: Path | None = None) -> Settings:
+    """Settings of a command, which ends where one is not valid, and says which: like an argument that is not.
+
+    Parameters
+    ----------
+    data_dir
+        The folder that the command's arguments name, if they do.
+    """
+    try:
+        return Settings() if data_dir is None else Settings(data_dir=data_dir)
+    except ValidationError as error:
+        for problem in invalid_settings(error):
+            print(f"mrasfm: error: {problem}.", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def invalid_settings(error: ValidationError) -> Iterator[str]:
+    """Say of each setting that is not valid what is wrong, and which variable to correct."""
+    for problem in error.errors():
+        name = ".".join(str(part) for part in problem["loc"])
+        what = str(problem["msg"]).removeprefix("Value error, ")
+        yield f"{name} is not valid: {what}. Correct MRASFM_{name.upper()}"

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from service.settings import Settings
+from service.settings import Settings, settings_of_command
 
 if TYPE_CHECKING:
     from sqlalchemy.orm import Session
@@ -63,7 +63,7 @@ def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The settings of the service that the arguments name."""
-    return Settings() if arguments.data is None else Settings(data_dir=arguments.data)
+    return settings_of_command(data_dir=arguments.data)
 
 
 def holds_state(settings: Settings) -> bool:

@@ -8,7 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from service.logs import add_log_level, configure
-from service.settings import Settings
+from service.settings import Settings, settings_of_command
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -31,7 +31,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Serve until told to stop."""
     from service.api.server import serve
 
-    settings = Settings()
+    settings = settings_of_command()
     configure(arguments.log_level)
     return serve(
         partial(make_app, settings, arguments.log_level),

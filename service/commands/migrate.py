@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from service.commands.administration import EXIT_CANNOT_RUN
-from service.settings import Settings
+from service.settings import settings_of_command
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -25,7 +25,7 @@ def run(arguments: argparse.Namespace) -> int:
     from service.database.connections import migrate
     from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
 
-    settings = Settings()
+    settings = settings_of_command()
     try:
         with unusable_is_told(settings):
             migrate(settings)

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from service.commands.administration import EXIT_CANNOT_RUN
 from service.logs import add_log_level
-from service.settings import Settings
+from service.settings import Settings, invalid_settings
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -44,9 +44,8 @@ def run(arguments: argparse.Namespace) -> int:
         _say(f"error: {error}")
         return EXIT_CANNOT_RUN
     except ValidationError as error:
-        for problem in error.errors():
-            name = ".".join(str(part) for part in problem["loc"])
-            _say(f"error: {name} is not valid: {problem['msg']}. Correct MRASFM_{name.upper()} or the option for it.")
+        for problem in invalid_settings(error):
+            _say(f"error: {problem} or the option for it.")
         return EXIT_CANNOT_RUN
     _say("stopped. Started again with the same folder, it goes on where it was.")
     return 0

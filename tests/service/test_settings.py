@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from service.database.connections import migrate
-from service.settings import Settings
+from service.settings import Settings, settings_of_command
+from tests.helpers.live_api import REPOSITORY
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
 
@@ -54,6 +59,86 @@ def test_a_token_that_cannot_be_sent_or_can_be_guessed(monkeypatch: pytest.Monke
 def test_no_token(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MRASFM_METRICS_TOKEN", "")
     assert Settings().metrics_token is None
+
+
+@pytest.mark.parametrize(
+    ("name", "url"),
+    [
+        ("database_url", ""),
+        ("database_url", "mysql://mrasfm:hush@db/mrasfm"),
+        ("database_url", "postgres://mrasfm:hush@db/mrasfm"),
+        ("database_url", "postgresql+psycopg://mrasfm:hush@db:port/mrasfm"),
+        ("database_url", "mrasfm.sqlite3"),
+        ("redis_url", "http://:hush@broker:6379"),
+        ("redis_url", "redis://:hush@broker:port/0"),
+        ("redis_url", "broker:6379"),
+        ("artifacts_url", "ftp://store/hush"),
+        ("artifacts_url", "/srv/mrasfm"),
+    ],
+)
+def test_a_url_of_another_kind_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str, url: str
+) -> None:
+    monkeypatch.setenv(f"MRASFM_{name.upper()}", url)
+    with pytest.raises(SystemExit) as ended:
+        settings_of_command()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert re.fullmatch(rf"mrasfm: error: {name} is not valid: must be .+\. Correct MRASFM_{name.upper()}\.\n", said)
+    assert "hush" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "url"),
+    [
+        ("database_url", "sqlite:////srv/state.sqlite3"),
+        ("database_url", "postgresql://mrasfm@db/mrasfm"),
+        ("database_url", "postgresql+psycopg://mrasfm@/mrasfm?host=/run/postgresql"),
+        ("redis_url", "redis+socket:///run/valkey.sock?virtual_host=1"),
+        ("redis_url", "rediss://:hush@[::1]:6379/0"),
+        ("artifacts_url", "file:///srv/my%20state"),
+        ("artifacts_url", "s3://bucket"),
+        ("artifacts_url", "gs://bucket/prefix"),
+        ("artifacts_url", "az://container"),
+    ],
+)
+def test_a_url_of_a_kind_that_is_spoken(monkeypatch: pytest.MonkeyPatch, name: str, url: str) -> None:
+    monkeypatch.setenv(f"MRASFM_{name.upper()}", url)
+    given = getattr(Settings(), name)
+    assert url == (given if isinstance(given, str) else given.get_secret_value())
+
+
+@pytest.mark.parametrize("name", ["redis_url", "artifacts_url"])
+def test_an_empty_url_is_none(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """`mrasfm standalone` waited for a broker at no address."""
+    monkeypatch.setenv(f"MRASFM_{name.upper()}", "")
+    assert getattr(Settings(), name) is None
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "service api",
+        "service migrate",
+        "service keys list",
+        "service projects list",
+        "worker worker",
+        "worker reconciler",
+    ],
+)
+def test_every_command_names_a_wrong_setting(command: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", *command.split()],
+        cwd=REPOSITORY,
+        env={**os.environ, "MRASFM_UPLOAD_HOURS": "a day"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stderr.startswith("mrasfm: error: upload_hours is not valid: ")
+    assert done.stderr.endswith("Correct MRASFM_UPLOAD_HOURS.\n")
+    assert done.stderr.count("\n") == 1
 
 
 def test_the_defaults_fit_together() -> None:

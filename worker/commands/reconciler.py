@@ -7,7 +7,7 @@ import signal
 import threading
 
 from service.logs import add_log_level, configure
-from service.settings import Settings
+from service.settings import settings_of_command
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -26,9 +26,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Reconcile until told to stop."""
     from worker.reconciler import Reconciler
 
+    settings = settings_of_command()
     configure(arguments.log_level)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    Reconciler(Settings()).run(ended)
+    Reconciler(settings).run(ended)
     return 0

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Sequence
 
 from service.logs import add_log_level
-from service.settings import Settings
+from service.settings import Settings, settings_of_command
 
 QUEUES = ("checks", "reconstructions")
 
@@ -37,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     wanted = arguments.queues.split(",")
     unknown = sorted(set(wanted) - set(QUEUES))
-    settings = Settings()
+    settings = settings_of_command()
     if unknown or not 1 <= arguments.concurrency <= 1024 or settings.redis_url is None:
         what = "MRASFM_REDIS_URL is not set" if settings.redis_url is None else "--concurrency must be 1 to 1024"
         what = f"--queues: there is no queue {unknown[0]!r}, only {' and '.join(QUEUES)}" if unknown else what
