@@ -107,7 +107,7 @@ def outcome_of(ending: Ending) -> Outcome:
     if result.plan is not None:
         return Planned(plan=result.plan)
     failed = partial(Failed, stage=ending.stage, log_tail=ending.log_tail)
-    where = f"in stage {ending.stage!r}" if ending.stage else "before its first stage"
+    where = f"in stage '{ending.stage}'" if ending.stage else "before its first stage"
     if ending.timeout_s is not None:
         return failed(
             code="timeout",

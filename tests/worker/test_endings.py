@@ -13,6 +13,7 @@ import pytest
 
 import mrasfm_engine
 from mrasfm_engine.errors import InputError, MrasfmError, ReconstructionError, StorageError
+from schemas.artifacts import Stage
 from tests.worker.conftest import settings_with
 from worker.child import EXIT_OUT_OF_MEMORY
 from worker.child_output import TAIL_BYTES, ChildOutput
@@ -96,6 +97,11 @@ def test_kernel_that_says_so_makes_it_certain() -> None:
 @pytest.mark.parametrize("returncode", [-signal.SIGSEGV, -signal.SIGABRT, -signal.SIGTERM, 1, 0, EXIT_OUT_OF_MEMORY])
 def test_other_ends_count_against_the_job(returncode: int) -> None:
     assert failed(returncode=returncode).blame == 1.0
+
+
+def test_stages_of_the_worker_have_names_like_the_engines() -> None:
+    what = failed(returncode=1, stage=Stage.FETCH).what
+    assert what == "the engine's process ended in stage 'fetch' with an unexpected error (exit code 1)"
 
 
 def test_real_time_signal_has_no_name() -> None:
