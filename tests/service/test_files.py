@@ -21,6 +21,7 @@ import httpx
 import pytest
 from sqlalchemy import event
 
+from service.api.manifests.bounded_process import LARGE_BYTES
 from service.storage.blob_writer import BlobWriter, StoredFile
 from service.storage.blobs import Recorded
 from tests.helpers.live_api import Api, Client, forget_all, problem_of
@@ -157,6 +158,16 @@ def test_a_form_is_named_as_what_is_wrong(client: Client, drive: TinyDrive, driv
         assert "form" in problem["detail"]
     raw = client.put(f"/v1/drives/{drive_id}/files/{path}", content=data, headers={"Content-Type": "multipart/x"})
     assert raw.status_code == 201, "the bytes count"
+
+
+@pytest.mark.parametrize("size_bytes", [0, LARGE_BYTES])
+def test_a_form_in_place_of_a_document_is_named(client: Client, drive: TinyDrive, size_bytes: int) -> None:
+    manifest = drive.raw + b" " * size_bytes
+    for path, document in (("/v1/drives", manifest), ("/v1/reconstructions", b'{"drive_id": "drv_0"}')):
+        problem = problem_of(client.post(path, files={"file": document}), 422, "invalid-document")
+        assert problem["detail"] == "the body is a form (multipart/form-data), in which the document is one part"
+        assert "--data-binary" in problem["remedy"]
+    assert client.post("/v1/drives", content=manifest, headers={"Content-Type": "multipart/x"}).status_code == 201
 
 
 def test_a_file_that_is_not_here_yet(client: Client, drive: TinyDrive, drive_id: str) -> None:

@@ -15,9 +15,9 @@ from starlette.concurrency import run_in_threadpool
 from schemas.parsing import DocumentError, parse_document
 from service.api.context import DOCUMENT_WITHIN_S, Context
 from service.api.dependencies import CallerDep
-from service.api.http.request_bodies import BODY, Body
+from service.api.http.request_bodies import BODY, Body, refuse_form
 from service.api.manifests.bounded_process import LARGE_BYTES
-from service.errors import ServiceError, TooSlow, invalid_document, require_size
+from service.errors import InvalidDocument, ServiceError, TooSlow, invalid_document, require_size
 from service.settings import Settings
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -63,7 +63,14 @@ def parsed_body(
         async with AsyncExitStack() as held:
             turns = _Turns(context, caller.project_id, held)
             raw = await _read(request, max_bytes(context.settings), turns)
-            yield Body(await run_in_threadpool(parse, context, raw), raw)
+            try:
+                value = await run_in_threadpool(parse, context, raw)
+            except ServiceError as error:
+                if error.code == InvalidDocument.code:
+                    remedy = "Send the document alone: with curl --data-binary @FILE, not -F."
+                    refuse_form(request, InvalidDocument, what="the document", remedy=remedy)
+                raise
+            yield Body(value, raw)
 
     return read
 

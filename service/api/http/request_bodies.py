@@ -9,6 +9,8 @@ from typing import Any, Generic, TypeVar
 from fastapi import Request
 from pydantic import BaseModel
 
+from service.errors import ServiceError
+
 Value = TypeVar("Value")
 
 BODY = "the request's body"  # what errors call it
@@ -28,6 +30,28 @@ def request_sha256(request: Request, raw: bytes) -> str:
     digest = hashlib.sha256(target.encode())
     digest.update(raw)
     return digest.hexdigest()
+
+
+def refuse_form(
+    request: Request, refusal: type[ServiceError], *, what: str, remedy: str, code: str | None = None
+) -> None:
+    """Refuse the form that holds something good in the words of forms: it is the body that is wrong.
+
+    Parameters
+    ----------
+    refusal, code
+        Of the error that the body's bytes would be refused with.
+    what
+        The body should have been.
+
+    Raises
+    ------
+    ServiceError
+        Of this kind, where the body is a form.
+    """
+    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind.startswith("multipart/"):
+        raise refusal(f"the body is a form ({kind}), in which {what} is one part", remedy=remedy, code=code)
 
 
 # Models that bodies are parsed as: the OpenAPI page describes them.

@@ -21,7 +21,7 @@ from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, Cursor, IdempotentDep, Limit, answer
 from service.api.http.body_reading import json_body
 from service.api.http.paging import page_of
-from service.api.http.request_bodies import Body, describe, describe_bytes
+from service.api.http.request_bodies import Body, describe, describe_bytes, refuse_form
 from service.api.http.responses import gives, problems
 from service.api.routes.file_ingest import archive_watch, keep_archive, keep_file, require_room, require_wanted
 from service.database.tables import Blob, DriveFile
@@ -227,20 +227,10 @@ def _announced(request: Request, context: Context) -> _Announced:
 
 
 def _refuse_form(request: Request, error: ServiceError) -> None:
-    """Refuse the form that holds a good file in the words of forms, not of the file: it is the body that is wrong.
-
-    Raises
-    ------
-    ServiceError
-        Of the same kind as `error`, where that is about the body's bytes and the body is a form.
-    """
-    kind = request.headers.get("content-type", "").partition(";")[0].strip().lower()
-    if kind.startswith("multipart/") and isinstance(error, ImageRefused | NotAnArchive | WrongDigest):
-        raise type(error)(
-            f"the body is a form ({kind}), in which the file is one part",
-            remedy="Send the file's bytes alone: with curl --data-binary @FILE or -T FILE, not -F.",
-            code=error.code,
-        ) from error
+    """Refuse a form in place of a file, as `refuse_form` does."""
+    if isinstance(error, ImageRefused | NotAnArchive | WrongDigest):
+        remedy = "Send the file's bytes alone: with curl --data-binary @FILE or -T FILE, not -F."
+        refuse_form(request, type(error), what="the file", remedy=remedy, code=error.code)
 
 
 async def _drain(request: Request, stream: AsyncIterator[bytes]) -> None:
