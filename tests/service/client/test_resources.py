@@ -26,6 +26,7 @@ from service.database.tables import Drive, Job
 from service.domain import exports, jobs
 from tests.helpers.live_api import LIMITS, SCENE_FILES
 from tests.helpers.live_api import Client as Owner
+from tests.helpers.tiny_drive import tiny_drive
 from tests.service.client.conftest import Connect
 
 FILES = {"kitti/00/poses.txt": b"1 0 0\n", "report.json": b"{}"}
@@ -291,6 +292,22 @@ def test_commands(
         ("export", scene_id, "--format", "kitti", "--image-size", "3"),
     ):
         assert run(client, capsys, *words)[0] == 2, words
+
+
+@pytest.mark.parametrize("words", [("list", "drives"), ("show", "{drive_id}")])
+def test_names_that_the_terminal_lacks_the_characters_of_are_shown(client: Owner, words: tuple[str, ...]) -> None:
+    drive_id = client.create(tiny_drive("Weg zur Brücke 東京"))
+    command = [
+        sys.executable,
+        "-m",
+        "service.commands.client_program",
+        *(word.format(drive_id=drive_id) for word in words),
+    ]
+    environment = {**os.environ, "MRASFM_API_KEY": client.key, "MRASFM_URL": client.api.url}
+    environment["PYTHONIOENCODING"] = "latin-1"  # as terminals and files of other systems have it
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr.decode()
+    assert r"Weg zur Brücke \u6771\u4eac" in done.stdout.decode("latin-1")
 
 
 def test_who_stops_reading_gets_no_traceback(client: Owner) -> None:
