@@ -16,7 +16,14 @@ from service.errors import UploadLocked, WrongOffset
 # Smaller ones are sent again from their beginning: the questions where to go on would take as long.
 FROM_BYTES = 8 << 20
 
-_ENDED = (HTTPStatus.NOT_FOUND, HTTPStatus.GONE)
+# Answers to HEAD, which have no words, about uploads that have ended: refused where that answer was lost, or deleted.
+_NOT_ANY_MORE = (
+    HTTPStatus.NOT_FOUND,
+    HTTPStatus.GONE,
+    HTTPStatus.CONFLICT,
+    HTTPStatus.UNSUPPORTED_MEDIA_TYPE,
+    HTTPStatus.UNPROCESSABLE_ENTITY,
+)
 
 
 class ResumableUpload:
@@ -36,17 +43,15 @@ class ResumableUpload:
         self._file = file
         self._meter = FileMeter(meter)
         self._id = upload_id or ""
+        self._has_begun_anew = False
 
     def begin(self) -> str:
         """The upload's id: as before, where the service still knows it; else anew."""
+        self._has_begun_anew = False
         if self._id:
-            try:
-                self._offset(self._client.retry_budget())
-                return self._id
-            except ApiError as error:
-                if error.status not in _ENDED:
-                    raise
-        self._id = self._create()
+            self._offset(self._client.retry_budget())
+        else:
+            self._id = self._create()
         return self._id
 
     def _create(self) -> str:
@@ -91,13 +96,13 @@ class ResumableUpload:
             try:
                 return self._client.upload_offset(self._drive_id, self._id)
             except ApiError as error:
-                match error.status:
-                    case HTTPStatus.LOCKED:
-                        budget.pause(TroubleError(error, 1.0))
-                    case HTTPStatus.CONFLICT:  # an answer to HEAD has no words: this one says why, or begins anew
-                        self._id = self._create()
-                    case _:
-                        raise
+                if error.status == HTTPStatus.LOCKED:
+                    budget.pause(TroubleError(error, 1.0))
+                elif error.status in _NOT_ANY_MORE and not self._has_begun_anew:
+                    self._has_begun_anew = True
+                    self._id = self._create()  # says why, or begins anew
+                else:
+                    raise
 
 
 def counted_pieces(client: Client, file: LocalFile, meter: FileMeter, offset: int = 0) -> Iterator[bytes]:

@@ -119,6 +119,19 @@ def test_an_upload_that_is_gone_begins_anew(client: Client, connect: Connect, la
     assert client.get(f"/v1/drives/{sent.drive_id}").json()["state"] == "COMMITTED"
 
 
+def test_a_refusal_whose_answer_was_lost_is_told_in_the_services_words(
+    client: Client, connect: Connect, large_drive: Path
+) -> None:
+    """The service drops what it refuses: the next question where to go on has 404 for an answer, and no words."""
+    (large_drive / "front" / "000001.png").write_bytes(bytes(SIZE_BYTES + 1))
+    cut = Cut(b"PATCH ", answer_bytes=20, times=1)
+    with bad_network(client.api.url, cut) as network, pytest.raises(ApiError) as raised:
+        upload_drive(connect(client, url=network.url), DriveFolder.read(large_drive), parallel=1)
+    assert len(cut.seen) == 1
+    assert raised.value.code == "not-an-image"
+    assert "front/000001.png" in str(raised.value)
+
+
 @pytest.mark.parametrize("is_known", [True, False])
 def test_a_drive_that_is_committed_meanwhile(
     api: Api, client: Client, connect: Connect, large_drive: Path, is_known: bool
