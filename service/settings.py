@@ -7,6 +7,7 @@ Everything has a default that suits one machine; production sets `MRASFM_DATABAS
 from __future__ import annotations
 
 import operator
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -19,6 +20,8 @@ from pydantic import AfterValidator, Field, SecretStr, ValidationError, Validati
 from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
+
+from schemas.misspelt import similar_name
 
 # Numbers have both bounds: what does not fit the database's integers, or a date, would fail at the first request.
 _MAX_BYTES = 2**60
@@ -304,12 +307,27 @@ def settings_of_command(*, data_dir: Path | None = None) -> Settings:
     data_dir
         The folder that the command's arguments name, if they do.
     """
+    for problem in misspelt_variables(os.environ):
+        print(f"mrasfm: warning: {problem}", file=sys.stderr)
     try:
         return Settings() if data_dir is None else Settings(data_dir=data_dir)
     except ValidationError as error:
         for problem in invalid_settings(error):
             print(f"mrasfm: error: {problem}.", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def misspelt_variables(environment: Mapping[str, str]) -> Iterator[str]:
+    """Say of each variable that is spelt much like a setting's which one is meant: it has no effect.
+
+    Others that begin with `MRASFM_` are of the client, the engine or the operator.
+    """
+    for variable in sorted(environment):
+        prefix, _, name = variable.lower().partition("_")
+        if prefix == "mrasfm" and name not in Settings.model_fields:
+            meant = similar_name(name, Settings.model_fields)
+            if meant is not None:
+                yield f"{variable} is no setting and has no effect; did you mean MRASFM_{meant.upper()}?"
 
 
 def invalid_settings(error: ValidationError) -> Iterator[str]:

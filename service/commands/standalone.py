@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from service.commands.administration import EXIT_CANNOT_RUN
 from service.logs import add_log_level
-from service.settings import Settings, invalid_settings
+from service.settings import Settings, invalid_settings, misspelt_variables
 
 
 def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
@@ -38,6 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
     from service.standalone.supervisor import SupervisorError
     from service.storage.data_folder import DataFolderError
 
+    for problem in misspelt_variables(os.environ):
+        _say(f"warning: {problem}")
     try:
         run_standalone(_settings(arguments), workers=arguments.workers, log_level=arguments.log_level, say=_say)
     except (DataFolderError, BrokerServerError, StandaloneError, SupervisorError) as error:

@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from service.database.connections import migrate
-from service.settings import Settings, settings_of_command
+from service.settings import Settings, misspelt_variables, settings_of_command
 from tests.helpers.live_api import REPOSITORY
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
@@ -139,6 +139,33 @@ def test_every_command_names_a_wrong_setting(command: str) -> None:
     assert done.stderr.startswith("mrasfm: error: upload_hours is not valid: ")
     assert done.stderr.endswith("Correct MRASFM_UPLOAD_HOURS.\n")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("variable", "meant"),
+    [
+        ("MRASFM_DRIVE_RETENTION_DAY", "MRASFM_DRIVE_RETENTION_DAYS"),
+        ("mrasfm_max_file_size", "MRASFM_MAX_FILE_BYTES"),
+        ("MRASFM_ENGINE_THREADS", None),
+        ("mrasfm_port", None),
+        ("MRASFM_API_KEY", None),
+        ("MRASFM_URL", None),
+        ("MRASFM_MODELS", None),
+        ("MRASFM_CHECKER_MEMORY", None),
+        ("DRIVE_RETENTION_DAY", None),
+    ],
+)
+def test_a_misspelt_variable_is_named(variable: str, meant: str | None) -> None:
+    said = [] if meant is None else [f"{variable} is no setting and has no effect; did you mean {meant}?"]
+    assert list(misspelt_variables({variable: "1"})) == said
+
+
+def test_commands_warn_of_misspelt_variables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("MRASFM_UPLOAD_HOUR", "1")
+    assert settings_of_command(data_dir=tmp_path).upload_hours == 24.0
+    assert "mrasfm: warning: MRASFM_UPLOAD_HOUR is no setting and has no effect" in capsys.readouterr().err
 
 
 def test_the_defaults_fit_together() -> None:

@@ -66,8 +66,13 @@ def test_a_wrong_setting_is_named(
     named: str,
 ) -> None:
     monkeypatch.setenv(variable, value)
+    monkeypatch.setenv("MRASFM_UPLOAD_HOUR", "1")
     assert run("--data", str(tmp_path / "state")) == 2
-    assert named in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert named in said
+    assert (
+        "mrasfm: warning: MRASFM_UPLOAD_HOUR is no setting and has no effect; did you mean MRASFM_UPLOAD_HOURS?" in said
+    )
     assert not (tmp_path / "state").exists()
 
 
