@@ -253,7 +253,7 @@ def checked_url(url: str) -> str:
     Raises
     ------
     ClientError
-        Where it is not http or https, or holds a key, a query or a fragment.
+        Where it is not http or https, holds a key, a query or a fragment, or ends with /v1.
     """
     try:
         parsed = httpx.URL(url.strip())
@@ -263,7 +263,10 @@ def checked_url(url: str) -> str:
         raise ClientError("the URL holds a user or password. Give the URL alone, and the key in MRASFM_API_KEY.")
     if parsed.scheme not in ("http", "https") or not parsed.host or parsed.query or parsed.fragment:
         raise ClientError(f"{url!r} is not the URL of a service. Give one such as https://maps.example.org.")
-    return str(parsed).rstrip("/")
+    root = str(parsed).rstrip("/")
+    if parsed.path.rstrip("/").endswith("/v1"):
+        raise ClientError(f"the URL {url!r} ends with /v1, which every request adds. Give {root.removesuffix('/v1')}.")
+    return root
 
 
 def is_loopback(host: str) -> bool:

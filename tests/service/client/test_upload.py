@@ -243,6 +243,12 @@ def test_what_cannot_be_a_url_is_refused(url: str) -> None:
     assert "secret" not in str(refused.value)
 
 
+@pytest.mark.parametrize("url", ["https://host/maps/v1", "https://host/maps/v1/"])
+def test_the_path_that_every_request_adds_is_refused_in_a_url(url: str) -> None:
+    with pytest.raises(ClientError, match=r"^the URL '.+' ends with /v1, .* Give https://host/maps\.$"):
+        LibraryClient(url, "key")
+
+
 def test_a_client_that_is_stopped_waits_for_nothing(client: Client, connect: Connect) -> None:
     silent = [Cut(part, answer_bytes=0, times=9, silent=True) for part in (b"/status", b"/jobs/")]
     with bad_network(client.api.url, *silent) as network, ThreadPoolExecutor() as pool:
