@@ -25,7 +25,7 @@ from mrasfm_engine.mapping.placement import (
 )
 from mrasfm_engine.mapping.receiver_clock import ReceiverClock
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
-from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses
+from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses, shape_fault
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -49,6 +49,8 @@ class AbsolutePriors:
         Fit of the rough poses' positions.
     rough_rotations
         Their rotations as a term.
+    rough_fault
+        Why rough poses take no part in the finished scene; empty where they do.
     """
 
     gnss: GnssTrack | None = None
@@ -57,6 +59,7 @@ class AbsolutePriors:
     placement: Placement | None = None
     rough: Placement | None = None
     rough_rotations: RotationPrior | None = None
+    rough_fault: str = ""
     placed_by_rough_poses: bool = False
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
@@ -113,12 +116,21 @@ class AbsolutePriors:
                 )
             if not self._set_clock(mapper):
                 break
+        self._place_by_rough_poses(mapper)
+        self._renew_rough(mapper)
+
+    def _place_by_rough_poses(self, mapper: Mapper) -> None:
+        """Move the scene to where rough poses say, if positions do not and if they have its shape."""
         sigma = mapper.drive.manifest.rough_poses
-        if self.positions is None and self.rough_world_from_rig is not None and sigma is not None:
+        if self.rough_world_from_rig is None or sigma is None:
+            return
+        self.rough_fault = ""
+        if mapper.config.bundle_adjustment.reassessment:
+            self.rough_fault = shape_fault(mapper, self.rough_world_from_rig, sigma.sigma_translation_m)
+        if self.positions is None and not self.rough_fault:
             self.placed_by_rough_poses = place_by_rough_poses(
                 mapper, self.rough_world_from_rig, sigma.sigma_translation_m
             )
-        self._renew_rough(mapper)
 
     def factor_by_positions(self, mapper: Mapper) -> float:
         """Factor, about, by which the scene has to grow to be as long as the receiver says; 1 without a receiver."""
@@ -187,6 +199,8 @@ class AbsolutePriors:
         self.rough, self.rough_rotations = None, None
         sigma = mapper.drive.manifest.rough_poses
         if self.rough_world_from_rig is None or sigma is None or not mapper.config.bundle_adjustment.priors:
+            return
+        if self.rough_fault:
             return
         found = compare_rough_poses(
             mapper,

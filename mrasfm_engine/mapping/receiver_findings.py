@@ -1,6 +1,6 @@
 """Findings on a receiver: why it is not used, jumps of its error, and a rig whose scale it contradicts.
 
-Rough poses may contradict that, too.
+Rough poses may contradict that, too, or the scene's shape.
 """
 
 from __future__ import annotations
@@ -106,6 +106,20 @@ def rough_scale_findings(mapper: Mapper, scale_of_rig: float | None) -> list[Fin
             f"rough_poses make {_length_beside_rig(mapper, scale_of_rig)}: the scene has their scale",
             "Check that positions in rough_poses and baselines in rig.cameras are metres, and declare "
             "sigma_translation_m of both. Leave poses out that have no metric scale.",
+        )
+    ]
+
+
+def rough_shape_findings(fault: str) -> list[Finding]:
+    """The finding that rough poses do not have the shape of the scene, where they do not; see `shape_fault`."""
+    if not fault:
+        return []
+    return [
+        warning(
+            "rough-poses-contradict",
+            f"rough_poses are not used, as they do not have the shape of the trajectory: {fault}",
+            "Give world_from_rig, not its inverse, of the rig and not of another body, in rig.body_axes, at the images' "
+            "times; declare the sigmas that poses and rotations have.",
         )
     ]
 

@@ -119,7 +119,10 @@ def _place(mapper: Mapper, result: Refinement, calibrated: Mapper | None, cancel
 def _no_scale_of_one_camera(mapper: Mapper, result: Refinement) -> ReconstructionError:
     """The error that nothing tells the scale; where the scene has hardly a unit, positions are not what is missing."""
     registered, units = int(mapper.registered.sum()), len(mapper.registered)
-    reason = result.placement.reason if result.placement is not None else "the drive has none that are usable"
+    reasons = [] if result.placement is None else [result.placement.reason]
+    if result.absolute.rough_fault:
+        reasons.append(f"rough poses do not have the shape of the trajectory: {result.absolute.rough_fault}")
+    reason = "; ".join(reasons) or "the drive has none that are usable"
     remedy = "Give a second camera with its baseline, or positions along the vehicle's trajectory."
     if registered < MIN_POSITIONS:
         reason = f"images link only {registered} of {units} units, and {MIN_POSITIONS} are needed"

@@ -15,6 +15,9 @@ from mrasfm_engine.mapping.receiver_fit import MIN_POSITIONS, Placement
 from mrasfm_engine.types import Floats
 
 MIN_ROUGH_POSES = 2
+# Of the way's extent, that most rough poses of another shape are off by at least. Inverse poses and those of another
+# body's axes are off by all of it, and odometry that drifts by a tenth at most.
+OTHER_SHAPE = 0.3
 MIN_EXTENT_SIGMAS = 3.0  # of rough poses, to tell one camera's scale
 
 
@@ -40,6 +43,36 @@ def between_poses(a_from_rig: Floats, b_from_rig: Floats) -> Floats:
     """Transform a_from_b (4, 4) by which poses (n, 4, 4) of the same units agree: rotations determine its rotation."""
     rotation = robust_mean_rotation(a_from_rig[:, :3, :3] @ np.swapaxes(b_from_rig[:, :3, :3], 1, 2))
     return se3.transform(rotation, geometric_median(a_from_rig[:, :3, 3] - b_from_rig[:, :3, 3] @ rotation.T))
+
+
+def shape_fault(mapper: Mapper, rough_world_from_rig: Floats, sigma_translation_m: float) -> str:
+    """Words on how the way of rough poses (units, 4, 4; NaN where unknown) differs from the scene's, if it does.
+
+    Wherever it is, and however large: rough poses may tell the scale. A vehicle that hardly moves has no way to
+    compare.
+    """
+    units = np.flatnonzero(mapper.registered & np.isfinite(rough_world_from_rig[:, 0, 3]))
+    if len(units) < MIN_POSITIONS:
+        return ""
+    own, rough = mapper.state.world_from_rig[units], rough_world_from_rig[units]
+    off_m, reach_m = _off_m(own, rough)
+    if off_m < max(OTHER_SHAPE * reach_m, MIN_EXTENT_SIGMAS * sigma_translation_m):
+        return ""
+    inverse_off_m, inverse_reach_m = _off_m(own, se3.inverse(rough))
+    inverse = "; their inverses have it" if inverse_off_m < OTHER_SHAPE * inverse_reach_m else ""
+    return f"half of them are over {off_m:.2g} m off, of {reach_m:.2g} m that they reach{inverse}"
+
+
+def _off_m(own: Floats, rough: Floats) -> tuple[float, float]:
+    """Medians over rough poses (n, 4, 4): of their distance from the scene's own, and from their middle.
+
+    The scene is turned as both say that they are turned against each other, moved to their middle, and scaled to them.
+    """
+    turned_m = own[:, :3, 3] @ between_poses(rough, own)[:3, :3].T
+    way_m, rough_m = (places - np.median(places, axis=0) for places in (turned_m, rough[:, :3, 3]))
+    scale = max(0.0, float((way_m * rough_m).sum() / max((way_m**2).sum(), 1e-12)))
+    off_m, reach_m = (np.median(np.linalg.norm(by_m, axis=1)) for by_m in (scale * way_m - rough_m, rough_m))
+    return float(off_m), float(reach_m)
 
 
 def compare_rough_poses(

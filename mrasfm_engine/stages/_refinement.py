@@ -24,6 +24,7 @@ from mrasfm_engine.mapping.receiver_findings import (
     outlier_findings,
     refusal_findings,
     rough_scale_findings,
+    rough_shape_findings,
 )
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
@@ -151,6 +152,7 @@ def _refined(
         findings += refusal_findings(refined.placement) + jump_findings(mapper, refined.placement)
         findings += outlier_findings(refined.placement)
     findings += rough_scale_findings(mapper, refined.scale_of_rough_poses)
+    findings += rough_shape_findings(refined.absolute.rough_fault)
     if refined.intrinsics is not None:
         findings += refined.intrinsics.findings(mapper)
     findings += [

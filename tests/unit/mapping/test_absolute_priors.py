@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -9,6 +10,7 @@ import pytest
 from mrasfm_engine.bundle_adjustment.priors import RotationPrior, UprightPrior
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.errors import ReconstructionError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.alignment import align_rigid, align_similarity
 from mrasfm_engine.geometry.gnss_track import GnssTrack
@@ -18,7 +20,12 @@ from mrasfm_engine.mapping.incremental_mapping import run_incremental_mapping
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.mapping_report import describe_refinement
 from mrasfm_engine.mapping.placement import place_by_gnss
-from mrasfm_engine.mapping.receiver_findings import jump_findings, outlier_findings, rough_scale_findings
+from mrasfm_engine.mapping.receiver_findings import (
+    jump_findings,
+    outlier_findings,
+    rough_scale_findings,
+    rough_shape_findings,
+)
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import RoughPose, RoughTrajectory
@@ -108,6 +115,39 @@ def test_rough_poses_of_another_scale_than_the_rig_are_a_finding_and_the_sigma_h
     assert "rough_poses make the way 0.40" in finding.what
     assert result.certainty is not None
     assert 0.3 < -np.log(scale) / result.certainty.sigma_scale < 1.5
+
+
+def in_camera_axes(poses: np.ndarray) -> np.ndarray:
+    axes = np.eye(4)
+    axes[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    turned: np.ndarray = poses @ axes
+    return turned
+
+
+@pytest.mark.parametrize("wrong", [se3.inverse, in_camera_axes])
+def test_rough_poses_of_another_shape_take_no_part(wrong: Callable[[np.ndarray], np.ndarray]) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=1500)
+    poses = wrong(rough_poses(simulated))
+    simulated = with_rough_poses(simulated, poses)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    mapper.complete()
+    result = refine(mapper, AbsolutePriors(rough_world_from_rig=poses))
+    assert not result.placed_by_rough_poses
+    assert not result.absolute.terms(mapper)
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert scale == pytest.approx(1.0, abs=0.01)  # that of the rig
+    [finding] = rough_shape_findings(result.absolute.rough_fault)
+    assert ("their inverses have it" in finding.what) is (wrong is se3.inverse)
+
+
+def test_one_camera_with_rough_poses_of_another_shape_says_so() -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=1, points=1500)
+    poses = se3.inverse(rough_poses(simulated))
+    simulated = with_rough_poses(simulated, poses)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    mapper.complete()
+    with pytest.raises(ReconstructionError, match=r"rough poses do not have the shape .*their inverses have it"):
+        refine(mapper, AbsolutePriors(rough_world_from_rig=poses))
 
 
 def test_receiver_and_rough_poses_stand_side_by_side_in_worlds_of_their_own() -> None:
