@@ -118,8 +118,8 @@ def rough_shape_findings(fault: str) -> list[Finding]:
         warning(
             "rough-poses-contradict",
             f"rough_poses are not used, as they do not have the shape of the trajectory: {fault}",
-            "Give world_from_rig, not its inverse, of the rig and not of another body, in rig.body_axes, at the images' "
-            "times; declare the sigmas that poses and rotations have.",
+            "Give world_from_rig, not its inverse, of the rig and not of another body, in rig.body_axes, at the "
+            "images' times; declare the sigmas that poses and rotations have.",
         )
     ]
 
