@@ -386,27 +386,35 @@ def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
 
 
 def find_clock(mapper: Mapper, placement: Placement) -> ReceiverClock | None:
-    """The receiver's clock, as positions with a prior show it; None where nothing tells it.
+    """The receiver's clock, as positions with a prior show it; None where nothing tells it, or it is taken to be right.
 
     What a clock does must not pass for an error that wanders: sizes of errors are those that are most likely if it may
-    be off.
+    be off. They take a while, and of a clock that is right no error at all that wanders would make a wrong one.
     """
-    if not mapper.config.bundle_adjustment.reassessment:
-        return None
-    before_s = 0.0 if placement.clock is None else placement.clock.offset_s
-    if placement.clock is None:
-        unknown = ReceiverClock(offset_s=0.0, sigma_s=np.inf)
-        placement = with_prior(mapper, replace(placement, clock=unknown), thorough=True)
     positions = placement.prior
     assert positions is not None
+    if not mapper.config.bundle_adjustment.reassessment:
+        return None
+    if placement.clock is not None:
+        found = _clock_offset(mapper, positions)
+        return None if found is None else replace(found, offset_s=placement.clock.offset_s + found.offset_s)
+    found = _clock_offset(mapper, replace(positions, wander_m=np.zeros_like(positions.wander_m)))
+    if found is None or not found.is_wrong:
+        return None
+    unknown = ReceiverClock(offset_s=0.0, sigma_s=np.inf)
+    positions = with_prior(mapper, replace(placement, clock=unknown), thorough=True).prior
+    assert positions is not None
+    return _clock_offset(mapper, positions)
+
+
+def _clock_offset(mapper: Mapper, positions: ReceiverPositions) -> ReceiverClock | None:
     of_rig, sigma_rig = scale_of_baselines(mapper)
-    found = clock_offset(
+    return clock_offset(
         antenna_places_m(mapper, positions.unit, positions.lever_arm_m),
         positions,
         factor=1.0 / of_rig,
         sigma_factor=np.inf if mapper.drive.has_single_camera else sigma_rig,
     )
-    return None if found is None else replace(found, offset_s=before_s + found.offset_s)
 
 
 def _growth_by_term(mapper: Mapper, placement: Placement) -> float:
