@@ -26,6 +26,7 @@ SEEDS = 5
 WHITE_M, WANDER_M = 0.3, 0.5
 WANDERING = Receiver(white_m=WHITE_M, wander_m=WANDER_M, declared_m=math.hypot(WHITE_M, WANDER_M))
 EVERY, POOR_M = 5, 1.0
+GOOD, LATE_S = Receiver(white_m=0.02, declared_m=0.02), 0.3
 TENTH, FIRSTS = 10, (0, 2, 4, 6, 8)
 METRES_A_DEGREE = 111_320.0
 # Halves of PandaSet's cameras: of the first no two share a view, so that hardly anything but the prior tells the scale.
@@ -43,6 +44,7 @@ def receivers(data: Path, work: Path) -> Iterator[Figure]:
     yield from _wandering(data, work)
     yield from _sparse(data, work)
     yield from _slow(data, work)
+    yield from _late(data, work)
     yield from _single_camera(data, work)
     yield from _halves(data, work)
     yield from _turned_pair(data, work)
@@ -53,7 +55,7 @@ def _wandering(data: Path, work: Path) -> Iterator[Figure]:
     real, drive = _pandaset(data, work)
     errors = []
     for seed in range(SEEDS):
-        edited = edited_drive(drive, work / f"{real.name}, receiver {seed}", _wander(drive, seed))
+        edited = edited_drive(drive, work / f"{real.name}, receiver {seed}", _receive(drive, WANDERING, seed=seed))
         mrasfm("reconstruct", edited, "--out", edited.with_name(edited.name + ", scene"))
         found = evaluate(edited.with_name(edited.name + ", scene"), edited)
         yield exactly("21", f"{real.name}, receiver {seed}: images registered", found["registered_images"], real.images)
@@ -104,6 +106,28 @@ def _slow(data: Path, work: Path) -> Iterator[Figure]:
     what = f"kitti01, one position a second, {len(FIRSTS)} choices of which: metric RMSE"
     yield Figure(line="21", what=f"{what}, median", value=float(np.median(errors)), unit="m", most=0.15)
     yield Figure(line="21", what=f"{what}, worst", value=max(errors), unit="m")
+
+
+def _late(data: Path, work: Path) -> Iterator[Figure]:
+    """Drives that brake or turn with good positions that have the time of their arrival."""
+    for name, most_m in (("pandaset_002", 0.05), ("kitti01", 0.12), ("kitti06", 0.05)):
+        real = next(real for real in DRIVES if real.name == name)
+        drive = imported(data, name, work, *real.options)
+        edited = edited_drive(drive, work / f"{name}, late", _receive(drive, GOOD, seed=0), _delay)
+        scene, figure = work / f"{name}, late, scene", partial(Figure, line="21")
+        mrasfm("reconstruct", edited, "--out", scene)
+        found, refinement = evaluate(scene, edited), read_report(scene)["by_stage"]["refinement"]
+        title = f"{name}, positions of {GOOD.white_m} m that are {LATE_S} s late"
+        late_s = -refinement["gnss"].get("clock_offset_s", 0.0)
+        yield figure(what=f"{title}: they are found to be late by", value=late_s, unit="s", above=-1e-9)
+        yield figure(what=f"{title}: metric RMSE", value=found["metric"]["rmse_m"], unit="m", most=most_m)
+        yield figure(what=f"{title}: scale", value=found["similarity"]["scale"], above=0.0)
+        yield figure(what=f"{title}: sigma of the scale", value=refinement["scale"]["sigma_relative"])
+
+
+def _delay(manifest: dict[str, Any]) -> None:
+    for sample in manifest["gnss"]["samples"]:
+        sample["timestamp_us"] += round(LATE_S * 1e6)
 
 
 def _every(step: int, first: int) -> Edit:
@@ -202,8 +226,8 @@ def _cameras(drive: Path) -> list[str]:
     return [camera["name"] for camera in manifest["rig"]["cameras"]]
 
 
-def _wander(drive: Path, seed: int) -> Edit:
-    """Positions of the rig's origin with white noise and a Gauss-Markov error."""
+def _receive(drive: Path, receiver: Receiver, *, seed: int) -> Edit:
+    """Positions of the rig's origin with a receiver's errors."""
     truth = read_tum(drive / "truth.tum")
     # The truth's first pose may be tilted: the receiver's frame stands upright.
     up = truth.world_from_rig[:, :3, 2].mean(0)
@@ -211,7 +235,7 @@ def _wander(drive: Path, seed: int) -> Edit:
 
     def edit(manifest: dict[str, Any]) -> None:
         rng = np.random.default_rng(seed)
-        manifest["gnss"] = WANDERING.gnss(truth.timestamps_us, position_m, np.zeros(3), rng)
+        manifest["gnss"] = receiver.gnss(truth.timestamps_us, position_m, np.zeros(3), rng)
 
     return edit
 
