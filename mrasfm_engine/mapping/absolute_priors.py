@@ -103,21 +103,26 @@ class AbsolutePriors:
         self.placed_by_rough_poses = False
         if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
-        for _ in range(CLOCK_ROUNDS):
-            if self.gnss is not None and self.antenna_in_rig_m is not None:
-                self.placement = place_by_gnss(
-                    mapper,
-                    self.gnss,
-                    self.antenna_in_rig_m,
-                    sigma_scale=sigma_scale,
-                    rig_may_be_wrong=rig_may_be_wrong,
-                    thorough=True,
-                    clock=self.clock,
-                )
-            if not self._set_clock(mapper):
-                break
+        self._place_by_gnss(mapper, sigma_scale=sigma_scale, rig_may_be_wrong=rig_may_be_wrong)
         self._place_by_rough_poses(mapper)
         self._renew_rough(mapper)
+
+    def _place_by_gnss(self, mapper: Mapper, *, sigma_scale: float = 0.0, rig_may_be_wrong: bool = False) -> None:
+        """Move the scene to where positions say, by the clock that they show once it is there."""
+        if self.gnss is None or self.antenna_in_rig_m is None:
+            return
+        for _ in range(CLOCK_ROUNDS):
+            self.placement = place_by_gnss(
+                mapper,
+                self.gnss,
+                self.antenna_in_rig_m,
+                sigma_scale=sigma_scale,
+                rig_may_be_wrong=rig_may_be_wrong,
+                thorough=True,
+                clock=self.clock,
+            )
+            if not self._set_clock(mapper):
+                break
 
     def _place_by_rough_poses(self, mapper: Mapper) -> None:
         """Move the scene to where rough poses say, if positions do not and if they have its shape."""
@@ -173,12 +178,11 @@ class AbsolutePriors:
     def reassess(self, mapper: Mapper, *, thorough: bool = True) -> None:
         """Judge positions and rough poses by the adjusted scene."""
         if self.placement is not None and self.placement.prior is not None:
-            for _ in range(CLOCK_ROUNDS):
-                self.placement = reassess_positions(
-                    mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
-                )
-                if not (thorough and self._set_clock(mapper)):
-                    break
+            self.placement = reassess_positions(
+                mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
+            )
+            if thorough and self._set_clock(mapper):
+                self._place_by_gnss(mapper)
         if self.rough is not None:
             self._renew_rough(mapper)
 

@@ -14,6 +14,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_scene, scale_with_baselines
 from mrasfm_engine.mapping.georeferencing import (
+    BENDS,
     BENT,
     MOST,
     GnssAlignment,
@@ -408,10 +409,12 @@ def find_clock(mapper: Mapper, placement: Placement) -> ReceiverClock | None:
 
 
 def _clock_offset(mapper: Mapper, positions: ReceiverPositions) -> ReceiverClock | None:
+    """The clock's offset by positions that stand beside a scene which may bend."""
+    antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
     of_rig, sigma_rig = scale_of_baselines(mapper)
     return clock_offset(
-        antenna_places_m(mapper, positions.unit, positions.lever_arm_m),
-        positions,
+        antenna_m,
+        replace(positions, wander_m=np.hypot(positions.wander_m, BENDS[0] * extent_m(antenna_m))),
         factor=1.0 / of_rig,
         sigma_factor=np.inf if mapper.drive.has_single_camera else sigma_rig,
     )
