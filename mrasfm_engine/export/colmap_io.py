@@ -122,7 +122,8 @@ def _read_binary(folder: Path) -> ModelRead:
 
 def read_of(model: pycolmap.Reconstruction) -> ModelRead:
     """The content of COLMAP's object."""
-    points = np.reshape([point.xyz for point in model.points3D.values()], (-1, 3))
+    coordinates = (point.xyz for point in model.points3D.values())
+    points: Floats = np.fromiter(coordinates, dtype=np.dtype((np.float64, 3)), count=len(model.points3D))
     posed = set(model.reg_image_ids())
     return ModelRead(
         rigs={number: _rig(rig) for number, rig in model.rigs.items()},
