@@ -1,7 +1,11 @@
-"""Images of a bag as files: compressed ones with the bytes that they have, raw ones as PNG without loss."""
+"""Images of a bag as files: compressed ones with the bytes that they have, raw ones as PNG without loss.
+
+image_transport compresses a sensor's Bayer pattern as it is, as a gray image: of such ones the colours become a PNG.
+"""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -10,7 +14,7 @@ from numpy.typing import NDArray
 
 from mrasfm_engine.errors import InputError
 from schemas.drive import MAX_IMAGE_SIDE_PX
-from schemas.image_header import ImageHeaderError, header_of
+from schemas.image_header import ImageHeader, ImageHeaderError, ImageKind, header_of
 
 # By ROS's encoding: type of a channel, channels, and OpenCV's conversion to gray or BGR.
 _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
@@ -41,6 +45,8 @@ _ENCODINGS: dict[str, tuple[str, int, int | None]] = {
 }
 DEPTH_ENCODINGS = frozenset({"16UC1", "32FC1"})  # ROS's images of distances
 SUBSAMPLED = frozenset({"yuv422", "uyvy", "yuv422_yuy2", "yuyv"})  # two pixels share their colour
+# A compressed image's format: the encoding that was compressed and, where it was converted before, to which one.
+_COMPRESSED = re.compile(r"([^;\s]*)\s*;.*compressed\s*(\S*)\s*")
 PNG_EFFORT = 1  # of 9: more makes files a few percent smaller and takes several times as long
 
 
@@ -97,7 +103,25 @@ def size_and_suffix(message: Any, *, topic: str) -> tuple[tuple[int, int], str]:
             remedy="Record JPEG or PNG, or raw images.",
             code="unknown-encoding",
         ) from None
-    return (header.width, header.height), ".jpg" if header.format == "JPEG" else ".png"
+    size = (header.width, header.height)
+    if _bayer_conversion(message, header) is None:
+        return size, ".jpg" if header.format == "JPEG" else ".png"
+    if not header.complete:
+        raise _damaged(topic)
+    return size, ".png"
+
+
+def _bayer_conversion(message: Any, header: ImageHeader) -> int | None:
+    """OpenCV's conversion to BGR of a compressed image that is a Bayer pattern still; None of all others."""
+    described = _COMPRESSED.fullmatch(str(message.format))
+    if described is None or header.kind is not ImageKind.GRAY:
+        return None
+    encoding = described[2] or described[1]
+    return _ENCODINGS[encoding][2] if encoding.startswith("bayer_") and encoding in _ENCODINGS else None
+
+
+def _damaged(topic: str) -> InputError:
+    return InputError(f"{topic}: a compressed image is damaged", remedy="Record the topic again.", code="bad-image")
 
 
 def largest_value(message: Any, *, topic: str) -> int:
@@ -124,13 +148,27 @@ def file_content(message: Any, *, topic: str, shift: int = 0) -> bytes:
     Raises
     ------
     InputError
-        If a raw image is shorter than its size says.
+        If a raw image is shorter than its size says, or a compressed Bayer pattern is damaged.
     """
     if not is_raw(message):
         content: bytes = message.data.tobytes()
-        return content
+        conversion = _bayer_conversion(message, header_of(content, topic))
+        return content if conversion is None else _png(_colours(content, conversion, topic), topic)
     pixels = _pixels(message, topic)
-    pixels = pixels << shift if shift else pixels
+    return _png(pixels << shift if shift else pixels, topic)
+
+
+def _colours(content: bytes, conversion: int, topic: str) -> NDArray[Any]:
+    try:
+        pattern = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pattern is not None:
+            return np.asarray(cv2.cvtColor(pattern, conversion))
+    except cv2.error:
+        pass
+    raise _damaged(topic)
+
+
+def _png(pixels: NDArray[Any], topic: str) -> bytes:
     done, encoded = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, PNG_EFFORT])
     if not done:
         raise InputError(f"{topic}: an image could not be written as PNG", remedy="Record the topic again.")

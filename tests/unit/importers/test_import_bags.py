@@ -557,6 +557,35 @@ def test_sensors_of_fewer_bits_in_16(tmp_path: Path, bits: int, encoding: str) -
     )  # of the right camera's 8 bits there is nothing to say
 
 
+@pytest.mark.parametrize(
+    ("said", "is_pattern"),
+    [
+        ("bayer_rggb8; jpeg compressed ", True),
+        ("bayer_rggb8; png compressed bayer_rggb8", True),
+        ("bayer_rggb8; jpeg compressed mono8", False),
+        ("mono8; jpeg compressed mono8", False),
+        ("jpeg", False),
+    ],
+)
+def test_compressed_bayer_patterns_become_colours(tmp_path: Path, said: str, is_pattern: bool) -> None:
+    """image_transport compresses a pattern as it is, as a gray image; converted ones say so last."""
+    kind = ".png" if "png" in said else ".jpg"
+    content = cv2.imencode(kind, mosaic("rggb", FLAT))[1].tobytes()
+    made = stereo()
+    without("/left/image_raw")(made)
+    for f in range(2):
+        made.compressed("/left/image_raw/compressed", START_US + f * PERIOD_US, "left", content, said)
+    made.compressed("/left/image_raw/compressed", START_US + 2 * PERIOD_US, "left", content[:-40], said)
+    drive, summary = imported(made, tmp_path)
+    file = drive.root / next(image.file for image in drive.images if drive.cameras[image.camera].name == "left")
+    assert (file.suffix == ".png") == (is_pattern or kind == ".png")
+    assert any("a compressed image is damaged" in note for note in summary.notes) == is_pattern
+    if is_pattern:
+        assert np.abs(read_image_rgb(file)[2:-2, 2:-2].astype(int) - FLAT[2:-2, 2:-2]).max() <= 10
+    else:
+        assert file.read_bytes() == content
+
+
 def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     made = stereo()
     packed(RGB, "nv21")(made)
