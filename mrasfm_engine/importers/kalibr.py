@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -50,7 +51,7 @@ class ChainCamera:
 
 
 def read_camchain(path: Path) -> list[ChainCamera]:
-    """Cameras in the order of the chain.
+    """Cameras in the order of the chain: that of their numbers, as YAML in order of names has cam10 after cam1.
 
     Raises
     ------
@@ -75,7 +76,7 @@ def read_camchain(path: Path) -> list[ChainCamera]:
         said = " ".join(str(error).split())[:200]
         raise InputError(f"calibration {path} is not YAML: {said}", remedy=remedy, code="bad-calibration") from None
     cameras: list[ChainCamera] = []
-    for name, camera in chain.items():
+    for name, camera in _in_order(chain):
         where = f"calibration {path}: {name}"
         pose = np.eye(4)
         if cameras:
@@ -94,6 +95,12 @@ def read_camchain(path: Path) -> list[ChainCamera]:
             )
         )
     return cameras
+
+
+def _in_order(chain: dict[str, _Camera]) -> list[tuple[str, _Camera]]:
+    """Cameras by the numbers of their names; where others name them, as the file has them."""
+    numbered = all(re.fullmatch(r"cam[0-9]{1,9}", name) for name in chain)
+    return sorted(chain.items(), key=lambda item: int(item[0].removeprefix("cam"))) if numbered else [*chain.items()]
 
 
 def _lens(camera: _Camera, where: str) -> Lens:

@@ -24,6 +24,7 @@ from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.importers import bag_reader, bags
 from mrasfm_engine.importers.bag_cameras import is_rectified
 from mrasfm_engine.importers.drive_writer import ImportSummary
+from mrasfm_engine.importers.kalibr import read_camchain
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.io.images import read_image_gray, read_image_rgb
 from mrasfm_engine.preflight.drive_reader import check_drive, read_drive
@@ -666,6 +667,23 @@ def test_kalibrs_chain(tmp_path: Path) -> None:
     drive, summary = imported(made, tmp_path / "second", **options)
     np.testing.assert_allclose(drive.rig_from_cam[0], se3.transform(OPTICAL, np.zeros(3)), atol=1e-12)
     assert any("taken to look level" in note for note in summary.notes)
+
+
+def test_a_chain_in_order_of_names(tmp_path: Path) -> None:
+    """Kalibr's YAML is in order of names: cam10 stands after cam1, and its pose is that in cam9."""
+    step = se3.transform(se3.exp_so3([0.0, 0.1, 0.0]), [-0.1, 0.0, 0.0])
+    blocks = [
+        f"cam{number}:\n  T_cn_cnm1: {step.tolist()}\n  camera_model: pinhole\n  distortion_coeffs: [0, 0, 0, 0]\n"
+        f"  distortion_model: radtan\n  intrinsics: [50, 51, 23.5, 15.5]\n  resolution: [48, 32]\n"
+        f"  rostopic: /{number}\n"
+        for number in range(12)
+    ]
+    (tmp_path / "camchain.yaml").write_text("".join(sorted(blocks)))
+    chain = read_camchain(tmp_path / "camchain.yaml")
+    assert [camera.name for camera in chain] == [f"cam{number}" for number in range(12)]
+    for number, camera in enumerate(chain):
+        first_from_cam = np.linalg.matrix_power(se3.inverse(step), number)
+        np.testing.assert_allclose(camera.first_from_cam, first_from_cam, atol=1e-9)
 
 
 @pytest.mark.parametrize(
