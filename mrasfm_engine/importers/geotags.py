@@ -79,8 +79,8 @@ def _time_us(exif: dict[int, Any]) -> int | None:
 
 def _position(gps: dict[int, Any]) -> GeoTag | None:
     try:
-        latitude = _degrees(gps[LATITUDE]) * (-1 if f"{gps.get(LATITUDE_REF)}".startswith("S") else 1)
-        longitude = _degrees(gps[LONGITUDE]) * (-1 if f"{gps.get(LONGITUDE_REF)}".startswith("W") else 1)
+        latitude = _degrees(gps[LATITUDE]) * _sign(gps[LATITUDE_REF], "NS")
+        longitude = _degrees(gps[LONGITUDE]) * _sign(gps[LONGITUDE_REF], "EW")
         height = (
             float(gps[ALTITUDE]) * (-1 if _byte(gps.get(ALTITUDE_REF)) in BELOW else 1) if ALTITUDE in gps else None
         )
@@ -102,6 +102,15 @@ def _position(gps: dict[int, Any]) -> GeoTag | None:
 def _degrees(value: Any) -> float:
     degrees, minutes, seconds = (float(part) for part in value)
     return degrees + minutes / 60 + seconds / 3600
+
+
+def _sign(reference: Any, letters: str) -> int:
+    """1 or -1 by the hemisphere's letter; a position without one may be on another continent, and is none."""
+    text = reference.decode("ascii", "replace") if isinstance(reference, bytes) else f"{reference}"
+    letter = text.strip("\0 ").upper()[:1]
+    if not letter:
+        raise ValueError("no hemisphere")
+    return (1, -1)[letters.index(letter)]
 
 
 def _byte(value: Any) -> int:

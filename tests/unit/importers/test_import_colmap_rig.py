@@ -13,7 +13,7 @@ from PIL import Image
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.importers.geotags import read_geo_txt
+from mrasfm_engine.importers.geotags import read_exif, read_geo_txt
 from mrasfm_engine.importers.layouts import import_recording
 from mrasfm_engine.preflight.drive_reader import check_drive, read_drive
 from tests.helpers.exif import exif_of
@@ -330,3 +330,28 @@ def test_times_with_an_offset(rig: Path, tmp_path: Path) -> None:
     write_images(rig, lambda f: exif_of(time=f"2026:03:04 12:11:{12 + f:02d}", subsecond="25", offset="+02:00"))
     import_recording(rig, tmp_path / "drive")
     assert read_drive(tmp_path / "drive").timestamps_us[0] == 1_772_619_072_250_000
+
+
+@pytest.mark.parametrize(
+    ("references", "signs"),
+    [
+        (("s", "w"), (-1, -1)),
+        ((b"S\0", b"E\0"), (-1, 1)),
+        (("North", " West"), (1, -1)),
+        (("N", None), None),
+        ((None, "E"), None),
+        (("N", "?"), None),
+        (("", "E"), None),
+    ],
+)
+def test_hemispheres(tmp_path: Path, references: tuple[Any, Any], signs: tuple[int, int] | None) -> None:
+    """A position without them may lie on another continent, and is none."""
+    exif = exif_of(place=(33.5, 70.25, 5.0))
+    gps = exif.get_ifd(0x8825)
+    for field, reference in zip((1, 3), references, strict=True):
+        del gps[field]
+        gps.update({} if reference is None else {field: reference})
+    Image.new("L", SIZE).save(tmp_path / "image.jpg", exif=exif)
+    tag = read_exif(tmp_path / "image.jpg")[1]
+    found = None if tag is None else (tag.latitude_deg, tag.longitude_deg)
+    assert found == (None if signs is None else pytest.approx((33.5 * signs[0], 70.25 * signs[1])))
