@@ -16,6 +16,8 @@ from mrasfm_engine.types import Floats, Ints
 REMEDY = (
     "Give one line 'timestamp tx ty tz qx qy qz qw' a pose: seconds, metres, unit quaternion; '#' starts a comment."
 )
+MAX_TIME_S = 2**62 // 1_000_000  # microseconds have 64 bits
+MAX_POSITION_M = 1e9  # the earth's centre is 6.4e6 m away
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,7 +48,7 @@ def read_tum(path: Path) -> Trajectory:
         Where the file cannot be read or a line is malformed, not finite or repeats a timestamp; it names the line.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
         raise InputError(f"trajectory {path} does not exist", remedy="Check the path.") from error
     except (OSError, UnicodeDecodeError) as error:
@@ -84,9 +86,11 @@ def _parse_line(content: list[str]) -> tuple[int, list[float]]:
         raise ValueError("not all values are numbers") from None
     if not time_s.is_finite() or not np.isfinite(row).all():
         raise ValueError("not all values are finite")
-    time_us = round(time_s * 1_000_000)
-    if abs(time_us) > 2**62:
+    if time_s.copy_abs() > MAX_TIME_S:
         raise ValueError(f"timestamp {time_s} is out of range")
+    time_us = round(time_s * 1_000_000)
+    if max(map(abs, row[:3])) > MAX_POSITION_M:
+        raise ValueError(f"a position is over {MAX_POSITION_M:g} m from the origin")
     norm = float(np.linalg.norm(row[3:]))
     if abs(norm - 1) > 1e-2:
         raise ValueError(f"the quaternion's norm is {norm:.4g} instead of 1")

@@ -103,6 +103,9 @@ def test_timestamps_that_do_not_match_are_refused(
         ("one 0 0 0 0 0 0 1", "not all values are numbers"),
         ("1533151603.547590 0 0 0 0 0 0 1", "repeats the timestamp"),
         ("1e300 0 0 0 0 0 0 1", "out of range"),
+        ("1e99999999 0 0 0 0 0 0 1", "timestamp 1E+99999999 is out of range"),
+        ("-5e12 0 0 0 0 0 0 1", "out of range"),
+        ("1.0 0 1e200 0 0 0 0 1", "a position is over 1e+09 m from the origin"),
     ],
 )
 def test_a_malformed_line_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], line: str, message: str) -> None:

@@ -31,6 +31,13 @@ def test_foreign_files(tmp_path: Path) -> None:
     np.testing.assert_allclose(read.world_from_rig[0, :3, 0], [0, 1, 0], atol=1e-4)
 
 
+def test_a_byte_order_mark_is_no_value(tmp_path: Path) -> None:
+    path = tmp_path / "notepad.tum"
+    for first in ("# a comment\n", ""):
+        path.write_text(f"{first}1 2 3 4 0 0 0 1\n", encoding="utf-8-sig")
+        assert read_tum(path).timestamps_us.tolist() == [1_000_000]
+
+
 def test_an_empty_file_is_an_empty_trajectory(tmp_path: Path) -> None:
     (tmp_path / "a.tum").write_text("")
     assert read_tum(tmp_path / "a.tum").world_from_rig.shape == (0, 4, 4)
