@@ -15,10 +15,16 @@ LOOP_OVERLAP_M = 10.0
 MIN_SIDE_PX, MAX_SIDE_PX = 32, 8192  # of an image
 TEXTURES_PX = (64, 128, 256, 512, 1024)
 NOT_NEGATIVE = (
-    "seed", "parked_cars", "moving_cars", "same_way_cars", "moving_shadows", "exposure_jitter", "noise", "blur_px",
-    "standing_units", "time_skew_ms", "readout_ms", "gnss_noise_m", "gnss_drift_m", "gnss_bias_m", "biased_by_m",
-    "rough_noise_m", "rough_noise_deg", "perturb_rotation_deg", "perturb_translation_m",
+    "seed", "parked_cars", "moving_cars", "same_way_cars", "moving_shadows", "standing_units", "time_skew_ms",
+    "readout_ms",
 )  # fmt: skip
+# Beyond these a drive has positions that no manifest may have, images without a picture, or cameras off the vehicle.
+BOUNDS = {
+    "exposure_jitter": (0, 3), "noise": (0, 1000), "blur_px": (0, 100), "jpeg_quality": (0, 100),
+    "gnss_noise_m": (0, 100), "gnss_drift_m": (0, 100), "gnss_bias_m": (0, 100), "biased_by_m": (0, 10_000),
+    "gnss_offset_s": (-1e8, 1e8), "rough_noise_m": (0, 10_000), "rough_noise_deg": (0, 180),
+    "perturb_rotation_deg": (0, 180), "perturb_translation_m": (0, 50), "miscalibrated_by_deg": (-180, 180),
+}  # fmt: skip
 FRACTIONS = ("drop_images", "gnss_outliers", "shadow_strength")
 OTHER_FLAGS = {"standing_units": "standing", "shadow_strength": "shadows"}  # of options that do not have their names
 
@@ -130,6 +136,11 @@ class SynthOptions:
         for name in NOT_NEGATIVE:
             if not 0 <= getattr(self, name) < math.inf:
                 _refuse(f"{_flag(name)} {getattr(self, name)} is no amount", "Give zero or a positive number.")
+        for name, (lowest, highest) in BOUNDS.items():
+            if not lowest <= getattr(self, name) <= highest:  # also refuses NaN
+                _refuse(
+                    f"{_flag(name)} {getattr(self, name)} is no possible amount", f"Give {lowest:g} to {highest:g}."
+                )
         for name in FRACTIONS:
             if not 0 <= getattr(self, name) <= 1:
                 _refuse(f"{_flag(name)} {getattr(self, name)} is not a fraction", "Give a number from 0 to 1.")

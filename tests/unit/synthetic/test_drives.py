@@ -23,7 +23,7 @@ from mrasfm_engine.synthetic.drive_writer import TRUE_OWN_CAR_FOLDER, render_dri
 from mrasfm_engine.synthetic.mesh import Label
 from mrasfm_engine.synthetic.motion import drive_motion
 from mrasfm_engine.synthetic.occluder import place_truck
-from mrasfm_engine.synthetic.options import SpeedProfile, SynthOptions
+from mrasfm_engine.synthetic.options import BOUNDS, SpeedProfile, SynthOptions
 from mrasfm_engine.synthetic.own_car import UNLABELLED
 from mrasfm_engine.synthetic.rigs import TrueCamera, mounts, true_cameras
 from mrasfm_engine.synthetic.streets import lay_out
@@ -403,6 +403,34 @@ def test_nonsense_is_refused_with_a_remedy(changes: dict[str, object]) -> None:
 def test_what_is_refused_is_named_as_the_command_has_it(name: str, flag: str) -> None:
     with pytest.raises(InputError, match=f"^{flag} -1 "):
         SynthOptions(**{name: -1})
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("perturb_translation_m", 1e9, "--perturb-translation-m 1000000000.0 is no possible amount"),
+        ("gnss_bias_m", 1e5, "--gnss-bias-m 100000.0 is no possible amount"),
+        ("gnss_offset_s", float("nan"), "--gnss-offset-s nan is no possible amount"),
+        ("gnss_offset_s", 1e12, "--gnss-offset-s 1000000000000.0 is no possible amount"),
+        ("blur_px", 1e9, "--blur-px 1000000000.0 is no possible amount"),
+        ("jpeg_quality", 101, "--jpeg-quality 101 is no possible amount"),
+        ("parked_cars", -1, "--parked-cars -1 is no amount"),
+        ("drop_images", 1.5, "--drop-images 1.5 is not a fraction"),
+    ],
+)
+def test_amounts_that_no_drive_has_are_refused(option: str, value: float, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        small_options(**{option: value})
+
+
+@pytest.mark.usefixtures("painted_once")
+def test_the_largest_amounts_make_drives(tmp_path: Path) -> None:
+    """Manifests bound positions and the rig, and refuse what is beyond."""
+    amounts = {name: highest for name, (_, highest) in BOUNDS.items()}
+    for seed in range(3):
+        options = small_options(**TINY, **amounts, seed=seed, rough_poses=True, biased_drive=0, declare_sigmas=True)
+        render_drives(options, tmp_path / "drive", force=True)
+        assert len(load(tmp_path / "drive").frames) == 2
 
 
 def test_command_line_reaches_the_options() -> None:
