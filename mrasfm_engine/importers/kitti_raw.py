@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import datetime
 import re
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -40,10 +41,8 @@ GEODETIC, ROLL, PITCH, YAW, POSITION_ACCURACY = [0, 1, 2], 3, 4, 5, 23
 # The unit states one accuracy, of north and east. Satellites stand above and never below: heights are about half as
 # well known.
 VERTICAL_OVER_HORIZONTAL = 2.0
-NOTES = [
-    "GNSS: positions of an inertial navigation system. Heights are above the sea, taken as ellipsoidal; times are "
-    "KITTI's local ones, taken as UTC.",
-]
+TIMES_NOTE = "Times: KITTI's local ones, taken as UTC."
+GNSS_NOTE = "GNSS: positions of an inertial navigation system. Heights are above the sea, taken as ellipsoidal."
 
 
 def recognises(folder: Path) -> bool:
@@ -55,7 +54,11 @@ def _drives(folder: Path) -> dict[str, Path]:
     pattern = "*_drive_*_sync"
     candidates = [folder.resolve(), *folder.glob(pattern), *folder.glob(f"*/{pattern}")]
     found = [c for c in candidates if c.match(pattern) and any((c / name / "data").is_dir() for name in CAMERAS)]
-    return {path.name: path for path in sorted(found)}
+    count = Counter(path.name for path in found)
+    return {
+        path.name if count[path.name] == 1 else f"{path.parent.resolve().name}/{path.name}": path
+        for path in sorted(found)
+    }
 
 
 def read(folder: Path, scene: str | None = None) -> Recording:
@@ -109,7 +112,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         ],
         gnss=gnss,
         truth_is_gnss=True,
-        notes=[*NOTES, *notes_of_empty_cameras(every)],
+        notes=[*([] if gnss is None else [GNSS_NOTE]), TIMES_NOTE, *notes_of_empty_cameras(every)],
         unread_files={camera: unread_files(drive / camera / "data") for camera in CAMERAS},
     )
 

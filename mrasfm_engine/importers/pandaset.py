@@ -38,7 +38,7 @@ OPTIONS = ("scene",)
 # PandaSet does not state it. Its GNSS and the vehicle's poses are two outputs of one inertial navigation system with
 # corrections, and agree to some centimetres.
 SIGMA_GNSS_M = 0.05
-NOTES = [
+NOTES_OF_GNSS = [
     "GNSS: PandaSet states no accuracy, 0.05 m is assumed. Its heights are above the sea, taken as ellipsoidal.",
     "The truth and the GNSS are outputs of one inertial navigation system: their errors are not independent.",
 ]
@@ -132,13 +132,14 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         SourceUnit(source_frame=frame, timestamp_us=int(t), images=by_frame[frame], world_from_rig=pose)
         for frame, t, pose in zip(frames, unit_times_us, truth, strict=True)
     ]
+    gnss = _gnss(sequence)
     return Recording(
         layout="PandaSet",
         name=f"pandaset-{sequence.name}",
         cameras=cameras,
         units=units,
-        gnss=_gnss(sequence),
-        notes=[*NOTES],
+        gnss=gnss,
+        notes=[] if gnss is None else [*NOTES_OF_GNSS],
         unread_files={camera.name: unread_files(sequence / "camera" / camera.name) for camera in cameras},
     )
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -158,3 +159,19 @@ def test_a_missing_calibration_is_named(drive: Path, tmp_path: Path) -> None:
     (drive.parent / "calib_imu_to_velo.txt").unlink()
     with pytest.raises(InputError, match=r"calib_imu_to_velo.txt"):
         import_recording(drive, tmp_path / "drive")
+
+
+def test_without_an_inertial_unit_nothing_is_noted_of_one(drive: Path, tmp_path: Path) -> None:
+    assert any(note.startswith("GNSS:") for note in import_recording(drive, tmp_path / "with").notes)
+    shutil.rmtree(drive / "oxts")
+    notes = import_recording(drive, tmp_path / "without").notes
+    assert notes == ["Times: KITTI's local ones, taken as UTC."]
+
+
+def test_two_drives_of_one_name(drive: Path, tmp_path: Path) -> None:
+    """A copy beside the day's folder is not taken in its place."""
+    shutil.copytree(drive.parent, drive.parents[1] / "copy")
+    with pytest.raises(InputError, match=rf"2 scenes: {DAY}/{DRIVE}, copy/{DRIVE}"):
+        import_recording(drive.parents[1], tmp_path / "drive")
+    shutil.rmtree(drive.parents[1] / "copy" / DRIVE / "image_01")
+    assert import_recording(drive.parents[1], tmp_path / "drive", scene=f"copy/{DRIVE}").cameras == 1

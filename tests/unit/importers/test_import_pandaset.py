@@ -93,7 +93,7 @@ def test_gnss_is_the_vehicles_and_of_the_selected_frames(sequence: Path, tmp_pat
     assert gnss.antenna_in_rig_m == [0, 0, 0]
     assert gnss.samples[0].latitude_deg == pytest.approx(PLACE[0], abs=1e-9)
     (sequence / "meta" / "gps.json").unlink()
-    import_recording(sequence, tmp_path / "without")
+    assert import_recording(sequence, tmp_path / "without").notes == []
     assert read_drive(tmp_path / "without").manifest.gnss is None
 
 
