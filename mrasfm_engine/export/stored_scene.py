@@ -50,14 +50,15 @@ def read_source(folder: Path) -> ExportSource:
 
 
 @contextmanager
-def _damaged(folder: Path) -> Iterator[None]:
+def _damaged(path: Path) -> Iterator[None]:
+    """Name what is damaged: a file, or the folder where files of it do not belong together."""
     try:
         yield
     except MrasfmError:
         raise
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError) as error:
         raise InputError(
-            f"{folder} is damaged: {type(error).__name__}: {error}",
+            f"{path} is damaged: {type(error).__name__}: {error}",
             remedy="Copy or download it again, or make it anew.",
             code="damaged-scene",
         ) from error
@@ -180,10 +181,15 @@ def _arrays(folder: Path, drive: Drive, calibration: list[CameraCalibration], ri
     if len(units) != len(drive.manifest.frames) or [i["file"] for i in listed] != [i.file for i in images]:
         raise ValueError("poses.json and the drive's manifest speak of different images")
     image_registered = np.array([bool(image["registered"]) for image in listed], dtype=np.bool_)
-    points = read_points(folder / "model" / "points3D.bin")
+    with _damaged(folder / "model" / "points3D.bin"):
+        points = read_points(folder / "model" / "points3D.bin")
     features, observations = _observations(folder, images, len(points.xyz_m))
-    world_from_rig = _poses(units, "world_from_rig")
-    _, rows = read_vertices(folder / "points.ply")
+    with _damaged(folder / "poses.json"):
+        world_from_rig, world_from_cam = _poses(units, "world_from_rig"), _poses(listed, "world_from_cam")
+    with _damaged(folder / "frame.json"):
+        georeference = _georeference(frame)
+    with _damaged(folder / "points.ply"):
+        _, rows = read_vertices(folder / "points.ply")
     if len(rows) != len(points.xyz_m):
         raise ValueError(f"points.ply has {len(rows)} points, model/points3D.bin {len(points.xyz_m)}")
     rough = frame.get("rough_world_from_local")
@@ -205,9 +211,9 @@ def _arrays(folder: Path, drive: Drive, calibration: list[CameraCalibration], ri
         observation_keypoint=observations[:, 2],
         features=features,
         pairs=[],
-        georeference=_georeference(frame),
+        georeference=georeference,
         rough_world_from_local=None if rough is None else np.array(rough, dtype=np.float64),
-        unit_from_image=_unit_from_image(images, world_from_rig, _poses(listed, "world_from_cam"), calibration),
+        unit_from_image=_unit_from_image(images, world_from_rig, world_from_cam, calibration),
         rig_of_camera=rigs,
         unit_component=np.array([unit.get("component", 0) for unit in units], dtype=np.int64),
     )
@@ -215,7 +221,8 @@ def _arrays(folder: Path, drive: Drive, calibration: list[CameraCalibration], ri
 
 def _observations(folder: Path, images: list[DriveImage], points: int) -> tuple[list[ImageFeatures], Ints]:
     """Keypoints by image, and observations (n, 3): point, image, keypoint, sorted by point."""
-    model = read_images(folder / "model" / "images.bin")
+    with _damaged(folder / "model" / "images.bin"):
+        model = read_images(folder / "model" / "images.bin")
     features, found = [], [np.zeros((0, 3), np.int64)]
     for i, image in enumerate(images):
         known = model.get(i)

@@ -75,6 +75,16 @@ def test_a_written_scene_reads_back_as_it_was(scene_folder: Path) -> None:
         assert np.array_equal(one.params, other.params)
 
 
+@pytest.mark.parametrize("file", ["model/images.bin", "model/points3D.bin", "points.ply"])
+@pytest.mark.parametrize("content", [None, b"", b"\x09"])
+def test_a_damaged_file_of_a_scene_is_named(scene_folder: Path, file: str, content: bytes | None) -> None:
+    (scene_folder / file).unlink()
+    if content is not None:
+        (scene_folder / file).write_bytes(content)
+    with pytest.raises(InputError, match=rf"^{scene_folder}/{file} is damaged: "):
+        read_source(scene_folder)
+
+
 def test_kitti_poses_are_those_of_the_first_camera_from_its_first_one(scene_folder: Path) -> None:
     report = _exported(scene_folder, "kitti")
     scene, folder = make_scene(moving=True), scene_folder.parent / "out" / "kitti" / "00"
