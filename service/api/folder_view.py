@@ -92,7 +92,11 @@ def create_view(folder: Path, drives: Sequence[DriveFolder] = ()) -> tuple[FastA
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=_HOSTS)
     _add_page(app)
     _add_session(app, folder)
-    (_add_map if is_map else _add_scene)(app, folder, drives)
+    try:
+        (_add_map if is_map else _add_scene)(app, folder, drives)
+    except (KeyError, TypeError, AttributeError, ValueError) as error:  # as of the report of an export
+        what = f"{REPORT_FILE} and {MAP_FILE} are not those of a map" if is_map else f"{REPORT_FILE} is not a scene's"
+        raise FolderViewError(f"{folder}: {what}: give the folder of a complete scene or map.") from error
     _add_images(app, drives)
     add_console(app)
     return app, f"#/maps/{MAP_ID}/3d" if is_map else f"#/scenes/{SCENE_ID}/3d"

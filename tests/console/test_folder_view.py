@@ -61,6 +61,13 @@ def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "report.json").write_text("[")
     with pytest.raises(FolderViewError, match=r"report\.json cannot be read"):
         create_view(tmp_path)
+    for report in ({"formats": {}}, {"summary": []}, {"summary": {}, "components": 1}):  # the first is an export's
+        (tmp_path / "report.json").write_text(json.dumps(report))
+        with pytest.raises(FolderViewError, match=r"report\.json is not a scene's: give the folder of"):
+            create_view(tmp_path)
+    (tmp_path / "map.json").write_text("{}")
+    with pytest.raises(FolderViewError, match=r"report\.json and map\.json are not those of a map"):
+        create_view(tmp_path)
 
 
 @pytest.mark.parametrize("path", ["/etc/hostname", "../secret.png", "front/../../secret.png"])
