@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 ROS1_SUFFIX = ".bag"
 SUFFIXES = (ROS1_SUFFIX, ".mcap", ".db3")
+# SQLite's files of what is not in the database yet, where its writer was killed or is at it; rosbags reads none of it.
+JOURNALS = ("-wal", "-journal")
 # Recorders close a chunk of messages after some megabytes; only one message that is larger makes a larger one, and no
 # image that is read here has a gigabyte.
 MAX_CHUNK_BYTES = 1 << 30
@@ -118,9 +120,22 @@ def _reader(path: Path, scratch: Path) -> Reader1 | Reader2:
     from rosbags import rosbag1, rosbag2
 
     _bound_decompression()
+    _require_no_journal(path)
     if path.suffix == ROS1_SUFFIX and path.is_file():
         return rosbag1.Reader(path)
     return rosbag2.Reader(unpacked(path, scratch) if path.is_dir() else path)
+
+
+def _require_no_journal(path: Path) -> None:
+    """Refuse a bag with messages beside its database: those alone would be missing, without a word."""
+    for database in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
+        for journal in (database.with_name(database.name + suffix) for suffix in JOURNALS):
+            if journal.is_file() and journal.stat().st_size > 0:
+                raise InputError(
+                    f"bag {database} is not whole: {journal.name} holds what its recorder had not yet moved into it",
+                    remedy=f"End the recorder; if it was killed, run `sqlite3 {database.name} VACUUM` in its folder.",
+                    code="bad-bag",
+                )
 
 
 def _bound_decompression() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 import tempfile
 import tracemalloc
 from collections.abc import Callable
@@ -633,6 +634,30 @@ def test_frames_and_a_stamp_that_is_not_set(tmp_path: Path) -> None:
     drive = read_drive(tmp_path / "drive")
     assert drive.timestamps_us.tolist() == [START_US + PERIOD_US, START_US + 2 * PERIOD_US]
     assert np.array_equal(read_image_gray(drive.root / drive.images[0].file), picture(2))
+
+
+def test_messages_beside_a_database_are_not_lost(tmp_path: Path) -> None:
+    """A recorder in SQLite's WAL mode that is killed leaves the last messages in a file of their own."""
+    whole = stereo().write(tmp_path / "whole", "sqlite")
+    file = next(whole.glob("*.db3"))
+    recorder = sqlite3.connect(file)
+    recorder.execute("PRAGMA journal_mode = WAL")
+    rows = recorder.execute("SELECT * FROM messages").fetchall()
+    recorder.execute("DELETE FROM messages")
+    recorder.commit()
+    recorder.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    recorder.executemany(f"INSERT INTO messages VALUES ({', '.join('?' * len(rows[0]))})", rows)
+    recorder.commit()
+    killed = shutil.copytree(whole, tmp_path / "killed")
+    recorder.close()
+    for path in (killed, killed / file.name):
+        with pytest.raises(InputError, match=r"\.db3 is not whole: .*\.db3-wal holds what its recorder") as found:
+            import_recording(path, tmp_path / "drive")
+        assert f"sqlite3 {file.name} VACUUM" in found.value.remedy
+    repaired = sqlite3.connect(killed / file.name)  # as the remedy does
+    repaired.execute("VACUUM")
+    repaired.close()
+    assert import_recording(killed, tmp_path / "drive").images == 8
 
 
 # Calibrations beside the bag
