@@ -30,6 +30,7 @@ class ImageTopic:
     size: tuple[int, int] = (0, 0)
     suffixes: dict[int, str] = field(default_factory=dict)  # of the images' files, by their stamps in nanoseconds
     repeated: int = 0  # images with a stamp that another one has
+    unstamped: int = 0  # images with no time but that of their recording
     defects: list[InputError] = field(default_factory=list)  # of the other images
     holds_depth: bool = False
     largest: int = 0  # value of images of 16 bits
@@ -72,9 +73,10 @@ def wanted_topics(types: dict[str, str], topics: Sequence[str], path: Path) -> t
         )
     repeated = [name for name, count in Counter(map(camera_name, images)).items() if count > 1]
     if repeated:
+        own = ", ".join(topic for topic in images if camera_name(topic) == repeated[0])
         raise InputError(
-            f"several topics of --topics are of camera {repeated[0]}",
-            remedy="Name one topic of each camera.",
+            f"several topics are of camera {repeated[0]}: {own}",
+            remedy="Name one topic of each camera with --topics.",
             code="several-topics",
         )
     fixes = [t for t in topics if t in known_fixes] if topics else known_fixes
@@ -134,8 +136,12 @@ def read_content(
 
 def stamp_ns(entry: Entry) -> int:
     """The time that the message's sender has set; where there is none, the time of recording."""
+    return _set_ns(entry) or entry.received_ns
+
+
+def _set_ns(entry: Entry) -> int:
     stamp = entry.message.header.stamp
-    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec) or entry.received_ns
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def us_from_ns(time_ns: int) -> int:
@@ -170,6 +176,7 @@ def _add_image(images: ImageTopic, entry: Entry) -> None:
     images.size, images.frame = size, entry.message.header.frame_id.removeprefix("/")
     stamp = stamp_ns(entry)
     images.repeated += stamp in images.suffixes
+    images.unstamped += _set_ns(entry) == 0
     images.suffixes.setdefault(stamp, suffix)
 
 
@@ -194,6 +201,11 @@ def without_unusable(content: BagContent, *, is_asked: bool) -> list[str]:
         if images.shift:
             bits = 16 - images.shift
             notes.append(f"Images of {topic} use {bits} of 16 bits: all values are taken times {2**images.shift}.")
+        if images.unstamped:
+            notes.append(
+                f"Times: {images.unstamped} images of {topic} have no stamp. The times of their recording are taken, "
+                "which are later."
+            )
         if images.repeated:
             notes.append(f"Left out: {images.repeated} images of {topic} with a stamp that an earlier one has.")
     if not content.images:

@@ -588,6 +588,15 @@ def test_compressed_bayer_patterns_become_colours(tmp_path: Path, said: str, is_
         assert file.read_bytes() == content
 
 
+def test_topics_whose_cameras_would_have_one_name_are_named(tmp_path: Path) -> None:
+    made = stereo()
+    for topic in ("/a/left/image_raw", "/a_left/image_raw"):
+        made.image(topic, START_US, "left", picture(0))
+    message = refused(made, tmp_path)
+    assert "several topics are of camera a_left: /a/left/image_raw, /a_left/image_raw" in message
+    assert "--topics" in message
+
+
 def test_images_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     made = stereo()
     packed(RGB, "nv21")(made)
@@ -630,7 +639,10 @@ def test_frames_and_a_stamp_that_is_not_set(tmp_path: Path) -> None:
             message.header.stamp.sec = message.header.stamp.nanosec = 0
             del time_us
     path = made.write(tmp_path / "bag", "mcap", late_us=0)
-    assert import_recording(path, tmp_path / "drive", frames="1:3").images == 4
+    summary = import_recording(path, tmp_path / "drive", frames="1:3")
+    assert summary.images == 4
+    for name in ("left", "right"):
+        assert any(f"4 images of /{name}/image_raw have no stamp" in note for note in summary.notes)
     drive = read_drive(tmp_path / "drive")
     assert drive.timestamps_us.tolist() == [START_US + PERIOD_US, START_US + 2 * PERIOD_US]
     assert np.array_equal(read_image_gray(drive.root / drive.images[0].file), picture(2))
