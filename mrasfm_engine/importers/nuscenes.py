@@ -263,8 +263,14 @@ def _samples_of(scene: _Scene, samples: dict[str, _Sample], tables: Path) -> lis
     chain: list[_Sample] = []
     token = scene.first_sample_token
     while token:
-        if token not in samples or len(chain) > len(samples):
+        if token not in samples:
             raise _missing("sample", token, tables)
+        if len(chain) == len(samples):
+            raise InputError(
+                f"nuScenes tables {tables}: samples after {scene.first_sample_token!r} lead in a circle",
+                remedy="Unpack the tables again.",
+                code="broken-tables",
+            )
         chain.append(samples[token])
         token = chain[-1].next
     return chain

@@ -250,7 +250,7 @@ def put(table: str, index: int, field: str, value: Any) -> Callable[[Tables], No
         (drop("sample", 2), "sample 'scene-0061-2', which is not there"),
         (drop("sensor", 1), "sensor 's-CAM_FRONT'"),
         (drop("calibrated_sensor", 2), "calibrated_sensor 'c-CAM_BACK'"),
-        (put("sample", 3, "next", "scene-0061-0"), "sample"),  # runs in a circle
+        (put("sample", 3, "next", "scene-0061-0"), "samples after 'scene-0061-0' lead in a circle"),
         (put("calibrated_sensor", 1, "camera_intrinsic", [[1.0]]), "no 3x3 camera_intrinsic"),
         (put("calibrated_sensor", 1, "camera_intrinsic", [[40.0, 0.0], [1.0]]), "no 3x3 camera_intrinsic"),
         (put("sample_data", 2, "timestamp", 10**20), "sample_data.json: 2.timestamp"),
