@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,16 +56,25 @@ def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
                 remedy="Use letters, digits, '_', '.' and '-': NAME=FOLDER gives a scene another name.",
                 code="bad-scene-name",
             )
-        if name in result:
-            raise duplicate_scene(name, result[name], folder)
+        alike = like_named(name, result)
+        if alike is not None:
+            raise duplicate_scene(name, folder, alike, result[alike])
         result[name] = folder
     return result
 
 
-def duplicate_scene(name: str, folder: Path, other: Path) -> InputError:
+def like_named(name: str, others: Collection[str]) -> str | None:
+    """The one of other scenes whose files are those of a scene of this name on systems that ignore case, or None."""
+    return next((other for other in others if other.casefold() == name.casefold()), None)
+
+
+def duplicate_scene(name: str, folder: Path, other_name: str, other: Path) -> InputError:
     """Refusal of two scenes with one name."""
+    called = (
+        f"called {name!r}" if name == other_name else f"called {other_name!r} and {name!r}, one name on many systems"
+    )
     return InputError(
-        f"two scenes are called {name!r}: {folder} and {other}",
+        f"two scenes are {called}: {other} and {folder}",
         remedy="Give each scene once, or names of their own: NAME=FOLDER.",
         code="duplicate-scene",
     )

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrasfm_engine import __version__
 from mrasfm_engine.aggregation.association import Association, associate, coarse_transform
-from mrasfm_engine.aggregation.load import components_of, not_georeferenced, read_scene
+from mrasfm_engine.aggregation.load import components_of, like_named, not_georeferenced, read_scene
 from mrasfm_engine.aggregation.scales import SceneScale, find_scale, stated_sigma
 from mrasfm_engine.aggregation.seam import Seam, find_seam
 from mrasfm_engine.aggregation.source import SourceScene
@@ -104,9 +104,10 @@ def scenes(
     unfit: dict[str, InputError] = {}
     coming = {name: folder for one in folders.items() for name, folder in _with_components(*one).items()}
     for done, (name, folder) in enumerate(coming.items(), 1):
-        if _named(name, kept):
+        alike = like_named(name, [*kept, *map(drive_of_scene, kept)])
+        if alike is not None:
             raise InputError(
-                f"the map {run.into} has a scene called {name} already",
+                f"the map {run.into} has a scene called {alike} already",
                 remedy="Remove it first (--remove), or give the new one another name: NAME=FOLDER.",
                 code="duplicate-scene",
             )

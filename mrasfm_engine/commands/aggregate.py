@@ -65,14 +65,15 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _named(words: list[str]) -> dict[str, Path]:
     """Scenes by name; a folder without one has its own."""
+    from mrasfm_engine.aggregation.load import duplicate_scene, like_named
+
     result: dict[str, Path] = {}
     for word in words:
         given, path = split_name(word)
         name = path.resolve().name if given is None else given
-        if name in result:
-            from mrasfm_engine.aggregation.load import duplicate_scene
-
-            raise duplicate_scene(name, result[name], path)
+        alike = like_named(name, result)
+        if alike is not None:
+            raise duplicate_scene(name, path, alike, result[alike])
         result[name] = path
     return result
 

@@ -241,7 +241,7 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
 def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
     # A component's name stands for its drive, also where the largest one is not in the version.
-    taken = {drive_of_scene(scene.name) for scene in (*plan.remaining, *plan.removed)}
+    taken = {drive_of_scene(scene.name).casefold() for scene in (*plan.remaining, *plan.removed)}
     for drive_id, scene in plan.scenes.items():
         name = _name(scene.name, taken)
         session.add(JobMember(job_id=job.id, drive_id=drive_id, name=name, scene_id=scene.id))
@@ -310,11 +310,14 @@ def _rejection(drive: Drive) -> Problem:
 
 
 def _name(wanted: str, taken: set[str]) -> str:
-    """A scene's name in the map: the engine takes it, a file's name could be made of it, and no other has it."""
+    """A scene's name in the map: the engine takes it, a file's name could be made of it, and no other has it.
+
+    Names that are `taken` are in lower case, as many systems take names that differ in case alone for one.
+    """
     safe = _UNSAFE.sub("-", wanted).strip("-._")[:_NAME_LENGTH] or "drive"
     names = (safe if i == 1 else f"{safe}-{i}" for i in range(1, len(taken) + 2))
-    found = next(name for name in names if name not in taken)
-    taken.add(found)
+    found = next(name for name in names if name.casefold() not in taken)
+    taken.add(found.casefold())
     return found
 
 

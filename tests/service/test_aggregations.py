@@ -374,6 +374,13 @@ def test_drives_of_one_name(client: Client) -> None:
     assert [member["name"] for member in job["members"]] == ["Stra-e-1-2", "Stra-e-1-2-2", "Stra-e-1-2-3"]
 
 
+def test_drives_whose_names_differ_in_case_alone_have_scenes_of_different_names(client: Client) -> None:
+    drives = [client.frozen(tiny_drive(name, seed=f"{client.project_id}{name}")) for name in ("Night", "night")]
+    given = [member["name"] for member in client.aggregate(drives=drives)["members"]]
+    assert given == ["Night", "night-2"]
+    assert name_scenes({name: Path(name) for name in given})
+
+
 def test_names_of_drives_that_no_scene_can_have(client: Client) -> None:
     names = {"_night": "night", "...": "drive", "-_-": "drive-2", "ÄÖ ~ x": "x", "y" * 120: "y" * 80}
     drives = [client.frozen(tiny_drive(name, seed=f"{client.project_id}{name}")) for name in names]
