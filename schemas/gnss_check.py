@@ -15,6 +15,7 @@ JUMP_SIGMAS = 4.0
 # Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
 EXTRAPOLATED_SAMPLES = 1.5
 MAX_EXTRAPOLATION_US = 2_000_000
+MAX_GAP_US = 2_000_000  # between two samples, in which positions are interpolated: `gnss.max_time_gap_s` by default
 SEA_DEG = (np.pi / 2, np.pi)  # latitude and longitude off 0, 0 up to which there is no land; all radians are there
 WGS84_A_M, WGS84_E2 = 6_378_137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
 
@@ -45,7 +46,7 @@ def check_gnss(manifest: DriveManifest, image_times_us: NDArray[np.int64]) -> li
     return [
         *_check_land(gnss),
         *_check_heights(gnss),
-        *_check_cover(image_times_us, times),
+        *(_check_cover(image_times_us, times) or _check_gaps(image_times_us, times)),
         *_check_jumps(gnss, times),
         *_check_swapped(manifest, times),
     ]
@@ -145,6 +146,24 @@ def _check_cover(images: Ints, times: Ints) -> list[Finding]:
         ]
     what = f"{span}: {int((~covered).sum())} of {len(images)} images are without GNSS"
     return [warning("gnss-partial", what, "Nothing needs to be done; positions there come from the images alone.")]
+
+
+def _check_gaps(images: Ints, times: Ints) -> list[Finding]:
+    """The finding that most images lie between samples that are far apart, as where timestamps have another unit."""
+    after = np.clip(np.searchsorted(times, images), 1, max(len(times) - 1, 1))
+    gaps_us = np.diff(times)[after - 1] if len(times) > 1 else np.zeros(len(images), dtype=np.int64)
+    lost = (gaps_us > MAX_GAP_US) & ~np.isin(images, times)
+    if lost.mean() <= 0.5:
+        return []
+    return [
+        warning(
+            "gnss-sparse",
+            f"{int(lost.sum())} of {len(images)} images lie between gnss.samples that are over "
+            f"{MAX_GAP_US / 1e6:.0f} s apart, by up to {gaps_us.max() / 1e6:.3g} s: they have no position",
+            "Check that timestamp_us of gnss.samples are microseconds. Of a receiver that comes so seldom, samples at "
+            "the times of images count.",
+        )
+    ]
 
 
 def _seconds(time_us: np.int64) -> str:

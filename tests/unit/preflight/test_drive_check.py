@@ -508,6 +508,15 @@ def test_gnss_of_part_of_the_drive(drive_document: Document, write_drive: WriteD
     assert "2 of 10 images" in only(write_drive(drive_document), "gnss-partial", Severity.WARNING).what
 
 
+def test_gnss_whose_times_have_another_unit(drive_document: Document, write_drive: WriteDrive) -> None:
+    samples = drive_document["gnss"]["samples"]
+    first_us = samples[0]["timestamp_us"]
+    for sample in samples:  # nanoseconds since the first image
+        sample["timestamp_us"] = first_us + 1000 * (sample["timestamp_us"] - first_us)
+    finding = only(write_drive(drive_document), "gnss-sparse", Severity.WARNING)
+    assert "8 of 10 images lie between gnss.samples that are over 2 s apart, by up to 100 s" in finding.what
+
+
 def test_gnss_jump(drive_document: Document, write_drive: WriteDrive) -> None:
     samples = drive_document["gnss"]["samples"]
     samples[2]["latitude_deg"] += 9 / 111_000  # 100 m/s and half a metre of noise: still a car in bad reception
