@@ -21,6 +21,7 @@ from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
 from schemas import Camera, DriveManifest, Pose
 from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, component_folder, component_scene
+from schemas.file_names import portable_key
 from schemas.gnss_check import MAX_SPEED_MPS
 
 SCHEMA_VERSION = 1
@@ -65,7 +66,7 @@ def name_scenes(scenes: Mapping[str, Path] | Sequence[Path]) -> dict[str, Path]:
 
 def like_named(name: str, others: Collection[str]) -> str | None:
     """The one of other scenes whose files are those of a scene of this name on systems that ignore case, or None."""
-    return next((other for other in others if other.casefold() == name.casefold()), None)
+    return next((other for other in others if portable_key(other) == portable_key(name)), None)
 
 
 def duplicate_scene(name: str, folder: Path, other_name: str, other: Path) -> InputError:

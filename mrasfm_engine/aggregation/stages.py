@@ -104,8 +104,7 @@ def scenes(
     unfit: dict[str, InputError] = {}
     coming = {name: folder for one in folders.items() for name, folder in _with_components(*one).items()}
     for done, (name, folder) in enumerate(coming.items(), 1):
-        alike = like_named(name, [*kept, *map(drive_of_scene, kept)])
-        if alike is not None:
+        if (alike := like_named(name, [*kept, *map(drive_of_scene, kept)])) is not None:
             raise InputError(
                 f"the map {run.into} has a scene called {alike} already",
                 remedy="Remove it first (--remove), or give the new one another name: NAME=FOLDER.",

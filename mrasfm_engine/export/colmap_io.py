@@ -90,8 +90,9 @@ def by_itself(work: Callable[..., Result], folder: Path, *arguments: Any) -> Res
         Where the process ended early.
     """
     sizes = {name: (folder / name).stat().st_size for name in BINARY_FILES}
-    for name in (name for name, size in sizes.items() if not size):
-        raise ValueError(f"{name} is empty")  # without its file of rigs, COLMAP makes some up
+    for name, size in sizes.items():
+        if not size:  # without its file of rigs, COLMAP makes some up
+            raise ValueError(f"{name} is empty")
     if sum(sizes.values()) < SMALL_BYTES:
         return work(folder, *arguments)
     ended = run_in_subprocess(_result_or_error, work, (folder, *arguments))

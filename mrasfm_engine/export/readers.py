@@ -139,19 +139,19 @@ def cameras_text(path: Path) -> dict[int, CameraRead]:
     """The cameras of a text model by their ids."""
     return {
         int(number): CameraRead(model=model, size_px=(int(width), int(height)), params=np.array(params, np.float64))
-        for number, model, width, height, *params in _lines(path)
+        for number, model, width, height, *params in map(str.split, _lines(path))
     }
 
 
 def rigs_text(path: Path) -> dict[int, RigRead]:
     """The rigs of a text model by their ids."""
     rigs = {}
-    for number, sensors, reference, _, *words in _lines(path):
+    for number, sensors, reference, _, *words in map(str.split, _lines(path)):
         poses, rest = {}, iter(words)
         for kind, sensor, has_pose in zip(rest, rest, rest, strict=False):
-            pose = _pose(list(islice(rest, 7 * int(has_pose))))
+            cam_from_rig = pose(list(islice(rest, 7 * int(has_pose))))
             if kind == CAMERA:
-                poses[int(sensor)] = pose[:3]
+                poses[int(sensor)] = cam_from_rig[:3]
         rigs[int(number)] = RigRead(sensors=int(sensors), reference_is_imu=reference == IMU, cam_from_rig=poses)
     return rigs
 
@@ -159,57 +159,53 @@ def rigs_text(path: Path) -> dict[int, RigRead]:
 def frames_text(path: Path) -> dict[int, ModelFrame]:
     """The frames of a text model by their ids."""
     frames = {}
-    for number, rig, *words in _lines(path):
+    for number, rig, *words in map(str.split, _lines(path)):
         count, kinds = int(words[7]), words[8::3]
         cameras = {int(image): int(camera) for camera, image in zip(words[9::3], words[10::3], strict=True)}
         if kinds != [CAMERA] * count or len(cameras) != count:
             raise ValueError(f"frame {number} has other data than images")
-        frames[int(number)] = ModelFrame(int(rig), _pose(words[:7]), cameras)
+        frames[int(number)] = ModelFrame(int(rig), pose(words[:7]), cameras)
     return frames
 
 
-def _lines(path: Path) -> Iterator[list[str]]:
-    """Words of the lines of a text model's file, without its head."""
+def _lines(path: Path) -> Iterator[str]:
+    """Lines of a text model's file, without its head."""
     with path.open(encoding="utf-8", newline="\n") as file:
         for line in file:
-            if not line.startswith("#"):
-                if not line.endswith("\n"):
-                    raise ValueError("it ends early")
-                yield line.split()
+            if line.startswith("#"):
+                continue
+            if not line.endswith("\n"):
+                raise ValueError("it ends early")
+            yield line
 
 
-def _pose(words: Sequence[str]) -> Floats:
-    """A pose (4, 4) of COLMAP's seven numbers."""
-    w, x, y, z, *translation = (float(word) for word in words)
-    pose: Floats = transforms([x, y, z, w], translation)[0]
-    return pose
+def pose(numbers: Sequence[float] | Sequence[str]) -> Floats:
+    """A pose (4, 4) of COLMAP's seven numbers, or words of them."""
+    w, x, y, z, *translation = map(float, numbers)
+    result: Floats = transforms([x, y, z, w], translation)[0]
+    return result
 
 
 def images_text(path: Path) -> Iterator[ModelImage]:
     """All images of a text model."""
-    with path.open(encoding="utf-8", newline="\n") as file:
-        lines = (line for line in file if not line.startswith("#"))
-        for head in lines:
-            keypoints = next(lines, "")
-            if not keypoints.endswith("\n"):
-                raise ValueError("it ends early")
-            image_id, *numbers, camera_id, name = head.removesuffix("\n").split(" ", maxsplit=9)
-            rows = _numbers(keypoints).reshape(-1, 3)
-            pose = [float(v) for v in numbers]
-            yield ModelImage(int(image_id), int(camera_id), name, pose, rows[:, :2], rows[:, 2])
+    lines = _lines(path)
+    for head in lines:
+        keypoints = next(lines, "")
+        if not keypoints:
+            raise ValueError("it ends early")
+        image_id, *numbers, camera_id, name = head.removesuffix("\n").split(" ", maxsplit=9)
+        rows = _numbers(keypoints).reshape(-1, 3)
+        yield ModelImage(int(image_id), int(camera_id), name, [float(v) for v in numbers], rows[:, :2], rows[:, 2])
 
 
 def points_text(path: Path) -> Iterator[ModelPoints]:
     """All points of a text model, some thousand at one time: a long drive's take more memory than its scene."""
-    with path.open(encoding="utf-8", newline="\n") as file:
-        lines = (line for line in file if not line.startswith("#"))
-        while part := list(islice(lines, POINTS_AT_ONE_TIME)):
-            yield _points_of_lines(part)
+    lines = _lines(path)
+    while part := list(islice(lines, POINTS_AT_ONE_TIME)):
+        yield _points_of_lines(part)
 
 
 def _points_of_lines(lines: Sequence[str]) -> ModelPoints:
-    if not lines[-1].endswith("\n"):
-        raise ValueError("it ends early")
     counts = np.array([line.rstrip().count(" ") + 1 for line in lines], dtype=np.int64)
     numbers, ends = _numbers(" ".join(lines)), np.cumsum(counts)
     if len(numbers) != counts.sum():

@@ -16,7 +16,7 @@ from mrasfm_engine.export import readers
 from mrasfm_engine.export.colmap_io import ModelRead, binary_model, by_itself, read_of
 from mrasfm_engine.export.comparisons import POSE_TOLERANCE, Row, Rows
 from mrasfm_engine.export.file_contents import sha256
-from mrasfm_engine.export.readers import ModelImage, transforms
+from mrasfm_engine.export.readers import ModelImage
 from mrasfm_engine.types import Floats, Ints
 
 
@@ -125,14 +125,10 @@ def _images(binary: ModelRead, binary_folder: Path, path: Path) -> Rows:
 
 def _image(found: ModelImage, known: ModelImage) -> Rows:
     yield Row(f"image {known.image_id}", (found.name, found.camera_id), (known.name, known.camera_id))
-    yield Row(f"the pose of {known.name}", _composed(found), _composed(known), POSE_TOLERANCE)
+    poses = [readers.pose(image.cam_from_world) for image in (found, known)]
+    yield Row(f"the pose of {known.name}", poses[0], poses[1], POSE_TOLERANCE)
     yield Row(f"a keypoint of {known.name}", found.xy_px, known.xy_px, POSE_TOLERANCE)
     yield Row(f"a point seen in {known.name}", found.point_ids, known.point_ids)
-
-
-def _composed(image: ModelImage) -> Floats:
-    w, x, y, z, *translation = image.cam_from_world
-    return transforms([x, y, z, w], translation)
 
 
 def _points(binary: ModelRead, binary_folder: Path, path: Path) -> Rows:

@@ -202,9 +202,8 @@ class AbsolutePriors:
     def _renew_rough(self, mapper: Mapper) -> None:
         self.rough, self.rough_rotations = None, None
         sigma = mapper.drive.manifest.rough_poses
-        if self.rough_world_from_rig is None or sigma is None or not mapper.config.bundle_adjustment.priors:
-            return
-        if self.rough_fault:
+        has_priors = mapper.config.bundle_adjustment.priors
+        if self.rough_world_from_rig is None or sigma is None or self.rough_fault or not has_priors:
             return
         found = compare_rough_poses(
             mapper,

@@ -17,6 +17,7 @@ from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem, ProblemItem
 from schemas.api.resource import Finding
 from schemas.artifacts import Stage, drive_of_scene
+from schemas.file_names import portable_key
 from service.database.tables import TERMINAL, Drive, Job, JobMember, JobState, Map, MapScene, Project, Scene, new_id
 from service.domain import drives, jobs, maps
 from service.domain.access import require
@@ -241,7 +242,7 @@ def _require_quota(session: Session, project_id: str, plan: _Plan) -> None:
 def _members(session: Session, job: Job, plan: _Plan) -> Iterator[Job | None]:
     """Record what the aggregation brings; for each the job that makes its scene, None where that is there."""
     # A component's name stands for its drive, also where the largest one is not in the version.
-    taken = {drive_of_scene(scene.name).casefold() for scene in (*plan.remaining, *plan.removed)}
+    taken = {portable_key(drive_of_scene(scene.name)) for scene in (*plan.remaining, *plan.removed)}
     for drive_id, scene in plan.scenes.items():
         name = _name(scene.name, taken)
         session.add(JobMember(job_id=job.id, drive_id=drive_id, name=name, scene_id=scene.id))
@@ -312,12 +313,12 @@ def _rejection(drive: Drive) -> Problem:
 def _name(wanted: str, taken: set[str]) -> str:
     """A scene's name in the map: the engine takes it, a file's name could be made of it, and no other has it.
 
-    Names that are `taken` are in lower case, as many systems take names that differ in case alone for one.
+    Names that are `taken` are keys of them: many systems take names that differ in case alone for one.
     """
     safe = _UNSAFE.sub("-", wanted).strip("-._")[:_NAME_LENGTH] or "drive"
     names = (safe if i == 1 else f"{safe}-{i}" for i in range(1, len(taken) + 2))
-    found = next(name for name in names if name.casefold() not in taken)
-    taken.add(found.casefold())
+    found = next(name for name in names if portable_key(name) not in taken)
+    taken.add(portable_key(found))
     return found
 
 
