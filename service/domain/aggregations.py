@@ -22,6 +22,7 @@ from service.database.tables import TERMINAL, Drive, Job, JobMember, JobState, M
 from service.domain import drives, jobs, maps
 from service.domain.access import require
 from service.domain.checkpoints import settings_sha256
+from service.domain.same_images import drives_of_one_recording
 from service.errors import (
     AggregationTooLarge,
     DriveNotCommitted,
@@ -158,6 +159,7 @@ def _checked(session: Session, project_id: str, asked: AggregationRequest, of_ma
         _require_once(plan, drive_id, "the request")
         plan.drives.append(by_id[drive_id])
     _require_ready(plan.drives, require_all=asked.require_all)
+    _require_different_recordings(session, plan)
     coming = len(plan.scenes) + len(plan.drives)
     if not coming and not plan.removed:
         raise NothingToDo("the request names neither drives nor scenes", remedy="Name what the map is made of.")
@@ -195,6 +197,21 @@ def _require_once(plan: _Plan, drive_id: str, what: str) -> None:
         raise DriveTwice(f"{what} brings drive {drive_id}, which is in the map as {kept.name!r}", remedy=remedy)
     if drive_id in plan.scenes or any(drive.id == drive_id for drive in plan.drives):
         raise DriveTwice(f"{what} brings drive {drive_id} a second time", remedy="Name each drive once.")
+
+
+def _require_different_recordings(session: Session, plan: _Plan) -> None:
+    """A recording that was uploaded twice would do the same."""
+    coming = {*plan.scenes, *(drive.id for drive in plan.drives)}
+    same = drives_of_one_recording(session, coming | plan.remaining_drives)
+    if same is None:
+        return
+    a, b = same
+    kept = [scene for scene in plan.remaining if scene.drive_id in (a.id, b.id)]
+    remedy = f"Take the one that is there out in the same request: remove {kept[0].scene_id}." if kept else ""
+    raise DriveTwice(
+        f"drives {a.id} ({a.name}) and {b.id} ({b.name}) have the same images",
+        remedy=remedy or "Name one of them, and delete the other if it was uploaded by mistake.",
+    )
 
 
 def _require_ready(found: Collection[Drive], *, require_all: bool) -> None:

@@ -238,8 +238,8 @@ class Client(httpx.Client):
         return stored
 
     def scene(self, files: dict[str, bytes], drive: TinyDrive | None = None) -> str:
-        """Publish a scene of a new drive, with these files; its id."""
-        job = self.reconstruct(self.frozen(drive))
+        """Publish a scene of a new recording, with these files; its id."""
+        job = self.reconstruct(self.frozen(drive or tiny_drive(seed=new_id("drv"))))
         return self.publish(self.claim(job["id"]), files)
 
 

@@ -12,6 +12,7 @@ from mrasfm_engine.aggregation.load import name_scenes
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.tables import Drive, Job, JobMember, Scene
 from service.domain import job_trees, jobs
+from service.domain.same_images import drives_of_one_recording
 from tests.helpers.executed_statements import statements_of
 from tests.helpers.live_api import ONE_ATTEMPT, Api, Client, problem_of, wait_until
 from tests.helpers.tiny_drive import tiny_drive
@@ -321,6 +322,30 @@ def test_refused_requests(client: Client, drives: list[str]) -> None:
     stranger = client.api.client()
     problem_of(stranger.post("/v1/aggregations", json={"drives": drives}), 404, "not-found")
     assert client.get("/v1/maps").json()["items"] == [], "a refused request leaves nothing behind"
+
+
+def test_one_recording_that_was_uploaded_twice(client: Client, drives: list[str]) -> None:
+    again = client.frozen(tiny_drive("again", seed=f"{client.project_id}0"))
+
+    def refused(**asked: Any) -> dict[str, Any]:
+        return problem_of(client.post("/v1/aggregations", json=asked), 422, "drive-twice")
+
+    problem = refused(drives=[*drives, again])
+    assert problem["detail"] == f"drives {drives[0]} (drive-0) and {again} (again) have the same images"
+    assert "Name one of them" in problem["remedy"]
+    assert client.get("/v1/maps").json()["items"] == []
+    scene_id = finish(client, client.reconstruct(drives[0])["id"])
+    refused(drives=[drives[1], again], scenes=[scene_id])
+    job = client.aggregate(drives=[drives[1], again])
+    assert {member["drive_id"] for member in job["members"]} == {drives[1], again}
+
+
+def test_drives_of_the_same_size_are_of_different_recordings(client: Client) -> None:
+    files = {name: tiny_drive(seed=f"{client.project_id} {name}") for name in ("a", "b")}
+    drives = [client.frozen(drive) for drive in files.values()]
+    with client.api.database.write() as session:
+        session.execute(update(Drive).where(Drive.id.in_(drives)).values(bytes_stored=1))
+        assert drives_of_one_recording(session, drives) is None
 
 
 def test_the_same_request_twice(client: Client, drives: list[str]) -> None:

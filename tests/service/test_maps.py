@@ -114,6 +114,9 @@ def test_what_cannot_be_added_or_removed(client: Client, drives: list[str], map_
         return problem_of(client.post("/v1/aggregations", json={"map_id": map_id, **asked}), status, code)
 
     refused(422, "drive-twice", drives=[drives[0]])
+    again = client.frozen(tiny_drive("again", seed=f"{client.project_id}0"))
+    assert "have the same images" in (problem := refused(422, "drive-twice", drives=[again]))["detail"]
+    assert "remove scn_" in problem["remedy"]
     refused(422, "not-in-map", remove=[drives[2]])
     refused(422, "removed-twice", drives=[drives[2]], remove=[drives[0], drives[0]])
     refused(422, "too-few-scenes", remove=[drives[0]])

@@ -9,6 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 from sqlalchemy import select
 
@@ -18,6 +19,7 @@ from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.api.aggregations import AggregationRequest
 from service.database.tables import Blob, Job, MapFile, MapScene, MapVersion
 from service.domain import aggregations, jobs, scenes
+from service.errors import DriveTwice
 from service.job_queue import JobQueue
 from tests.helpers.export_example import make_scene
 from tests.helpers.export_images import USUAL, written
@@ -110,10 +112,10 @@ def test_a_map_is_titled_by_its_name_and_a_drive_that_failed_is_a_finding(unpowe
 
 @pytest.mark.slow
 def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> None:
-    """And a drive that is broken is named; what was finished is reused; a version is made from another."""
+    """One recording comes once; what was finished is reused; a version is made from another."""
     world = unpowered
     ids = [world.add_drive(folder) for folder in two_drives]
-    broken = world.add_drive(two_drives[0])  # the same images: the engine refuses the drive twice
+    again = world.add_drive(two_drives[0])
     job, due = ask(world, drives=ids)
     assert len(due) == 2
     run(world, *due)
@@ -131,14 +133,8 @@ def test_two_drives_become_a_map(unpowered: World, two_drives: list[Path]) -> No
     with world.database.read() as session:
         assert names == set(session.scalars(select(MapScene.name)))
 
-    # The same drive under two ids: the service cannot know, the engine sees it, and the map stays as it is.
-    job, due = ask(world, drives=[broken], map_id=ended.map_id)
-    run(world, *due, job)
-    refused = world.job(job.id)
-    assert (refused.state, refused.attempt) == ("FAILED", 1)
-    assert refused.problem is not None
-    assert refused.problem["type"].endswith("same-drive")
-    assert str(world.settings.data_dir) not in json.dumps(refused.problem)
+    with pytest.raises(DriveTwice, match="have the same images"):
+        ask(world, drives=[again], map_id=ended.map_id)
     assert len(versions(world)) == 1
 
     # Another map of the same scenes: nothing that takes long is done again.
@@ -162,11 +158,15 @@ def publish_scene(world: World, folder: Path, drive: Path) -> tuple[str, str]:
 
 
 def named_drive(root: Path, name: str) -> Path:
-    """The example as a drive; its images show too little for a reconstruction."""
+    """The example as a drive, one of its images with a mark; they show too little for a reconstruction."""
     written(root / name, USUAL)
-    manifest = json.loads((root / name / "drive" / "drive.json").read_text())
-    (root / name / "drive" / "drive.json").write_text(json.dumps(manifest | {"name": name}))
-    return root / name / "drive"
+    drive = root / name / "drive"
+    manifest = json.loads((drive / "drive.json").read_text())
+    (drive / "drive.json").write_text(json.dumps(manifest | {"name": name}))
+    marked = min(drive.rglob("*.png"))
+    image = cv2.imread(str(marked))
+    cv2.imwrite(str(marked), cv2.putText(image, name, (9, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.0, (0, 0, 0)))
+    return drive
 
 
 def scene_of_example(world: World, root: Path, name: str) -> str:
@@ -184,7 +184,8 @@ def test_components_are_scenes_of_the_map(unpowered: World, two_drives: list[Pat
     in_components(street, street, folder / "tunnel")
     in_components(street, elsewhere, folder / "shaft")
     drive_along(street, folder / "lit", WAY + 1.0, lateral_m=0.8, seed=2)
-    ids = [publish_scene(world, folder / name, two_drives[0])[1] for name in ("tunnel", "lit")]
+    made = zip(("tunnel", "lit"), two_drives, strict=True)
+    ids = [publish_scene(world, folder / name, drive)[1] for name, drive in made]
     job, due = ask(world, scenes=ids)
     run(world, *due)
     ended = world.job(job.id)
@@ -204,7 +205,7 @@ def test_components_are_scenes_of_the_map(unpowered: World, two_drives: list[Pat
     assert "seams" in world.job(again.id).reused
 
     # A drive goes with all of its components; one that nothing places is named with its drive.
-    drive_id, scene_id = publish_scene(world, folder / "shaft", two_drives[1])
+    drive_id, scene_id = publish_scene(world, folder / "shaft", two_drives[0])
     job, due = ask(world, map_id=ended.map_id, remove=[ids[0]], scenes=[scene_id])
     run(world, *due)
     ended = world.job(job.id)
