@@ -297,10 +297,8 @@ def remove(session: Session, project_id: str, drive_id: str) -> Named:
     # Sub-maps end with their reconstruction, or have nobody any more who waits for them.
     needing = [job.id for job in active if job.kind not in (JobKind.PREFLIGHT, JobKind.SUBMAP)]
     if needing:
-        raise DriveInUse(
-            f"drive {drive.id} is needed by {len(needing)} jobs: {', '.join(needing[:3])}",
-            remedy="Wait for their end, or cancel them.",
-        )
+        by = f"{len(needing)} jobs: {', '.join(needing[:3])}" if len(needing) > 1 else f"job {needing[0]}"
+        raise DriveInUse(f"drive {drive.id} is needed by {by}", remedy="Wait until nothing needs it, or cancel what does.")
     require_unused(session, what=f"drive {drive.id}", drive_id=drive.id)
     for job in active:
         jobs.request_cancel(session, job.id)
