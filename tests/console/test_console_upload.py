@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tarfile
 import zipfile
 from pathlib import Path
@@ -352,6 +353,70 @@ def test_what_is_dropped_is_taken(open_console: Open, world: World, tmp_path: Pa
         page.locator("[data-step=done]").wait_for()
     states = [one["state"] for one in client.get("/v1/drives").json()["items"]]
     assert states == ["COMMITTED"] * 2
+
+
+def test_what_is_dropped_beside_the_place_for_it_leaves_the_page(open_console: Open, world: World) -> None:
+    """By default a browser opens the file in the page's place, which would end an upload."""
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, "upload")
+    for kind in ("dragover", "drop"):
+        event = f"new DragEvent('{kind}', {{bubbles: true, cancelable: true}})"
+        assert page.evaluate(f"document.querySelector('h1').dispatchEvent({event})") is False
+
+
+def test_a_drive_whose_commit_has_no_answer_is_asked_for_again(
+    open_console: Open, world: World, tmp_path: Path
+) -> None:
+    """The service froze the drive: sent anew, the folder would be a second one."""
+    client, drive = world.api.client(), tiny_drive("lost", seed="lost")
+    watched = open_console(world.api.url)
+    watched.expected = ("ERR_CONNECTION_RESET",)
+    page = watched.new_page()
+    page.add_init_script(IMPATIENT)
+    log_in(page, world.api.url, client.key)
+    lost: list[str] = []
+
+    def lose_first(route: Route) -> None:
+        if route.request.method != "POST" or route.request.url in lost:
+            return route.fallback()
+        lost.append(route.request.url)
+        route.fetch()
+        return route.abort("connectionreset")
+
+    page.route("**/v1/drives", lose_first)
+    page.route("**/v1/drives/*:commit", lose_first)
+    upload(page, world.api.url, folder_of(drive, tmp_path / "drive"))
+    assert len(lost) == 2
+    (only,) = client.get("/v1/drives").json()["items"]
+    assert only["state"] == "COMMITTED"
+
+
+def test_an_upload_that_failed_sends_nothing_more(open_console: Open, world: World, tmp_path: Path) -> None:
+    """Else it would go on beside the next one, and both would say how far they are."""
+    client, drive = world.api.client(), tiny_drive("failed", seed="failed", frames=40)
+    watched = open_console(world.api.url)
+    watched.expected = ("422",)
+    page = watched.new_page()
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "upload")
+    refusal = {"type": "urn:mrasfm:problem:bad-image", "title": "No", "detail": "no image", "remedy": "Check it."}
+    sent: list[str] = []
+
+    def refuse_first(route: Route) -> None:
+        sent.append(route.request.url)
+        if len(sent) == 1:
+            body = json.dumps(refusal)
+            route.fulfill(status=422, body=body, content_type="application/problem+json")
+        else:
+            page.wait_for_timeout(20)
+            route.fallback()
+
+    page.route("**/files/**/*.png?*", refuse_first)
+    choose(page, folder_of(drive, tmp_path / "drive"))
+    expect(page.get_by_role("alert")).to_contain_text("no image")
+    page.wait_for_timeout(1000)
+    assert len(sent) < 10 < len(drive.files)
 
 
 def test_a_folder_without_a_manifest_is_refused_with_a_remedy(open_console: Open, world: World, tmp_path: Path) -> None:

@@ -28,6 +28,17 @@ export const session = signal<Session | null | undefined>(undefined);
 
 const MAY_BE_THERE = "mrasfm-session"; // remembers that a cookie may be there, which scripts cannot see
 
+/** Which session it is: the cookie of all pages is one, so that another page may have begun another. */
+export function identityOf(one: Session | null | undefined): string {
+  return one ? `${one.key_id} ${one.session_expires_at ?? ""}` : "";
+}
+
+/** Calls `changed` when another page logged in or out. */
+export function watchSession(changed: () => void): void {
+  window.addEventListener("storage", (event) => (event.key === MAY_BE_THERE || event.key === null) && changed());
+  window.addEventListener("pageshow", (event) => event.persisted && changed()); // it was asleep, and heard nothing
+}
+
 export function remembersSession(): boolean {
   return localStorage.getItem(MAY_BE_THERE) === "1";
 }
@@ -67,7 +78,7 @@ export async function send(method: string, path: string, options: Options = {}):
     headers.set("Content-Type", "application/json");
     init.body = body;
   }
-  if (method === "POST" && path !== "v1/session") headers.set("Idempotency-Key", randomName());
+  if (method === "POST" && path !== "v1/session" && !headers.has("Idempotency-Key")) headers.set("Idempotency-Key", randomName());
   if (options.signal) init.signal = options.signal;
   let answer: Response;
   try {
@@ -93,6 +104,15 @@ export async function refusalOf(answer: Response): Promise<ProblemError> {
   const problem = isProblem ? await (answer.json() as Promise<Problem>).catch(() => null) : null; // HEAD gives no body
   const unknown = { title: `HTTP ${answer.status}`, detail: answer.statusText || "No details.", remedy: "Try again." };
   return new ProblemError(problem ?? unknown, answer.status);
+}
+
+const PASSING = [0, 408, 423, 429]; // 0: no answer
+const IN_FLIGHT = "urn:mrasfm:problem:request-in-flight"; // the same request, whose answer was lost
+
+/** Whether the same request may succeed later. */
+export function mayPass(error: unknown): boolean {
+  if (!(error instanceof ProblemError)) return true;
+  return PASSING.includes(error.status) || error.status >= 500 || error.problem.type === IN_FLIGHT;
 }
 
 export async function get<Resource>(path: string, abort?: AbortSignal): Promise<Resource> {

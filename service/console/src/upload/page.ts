@@ -21,18 +21,25 @@ export function UploadPage(): Shown {
   const [extra, setExtra] = useState(0);
   const abort = useRef(new AbortController());
   useEffect(() => () => abort.current.abort(), []);
+  useEffect(keepPage, []);
   const isBusy = progress !== null && progress.step !== "done" && problem === null;
   const begin = async (opening: Promise<Folder>): Promise<void> => {
+    const own = (abort.current = new AbortController());
     setProblem(null);
     setDrive(null);
     setProgress({ step: "creates", doneBytes: 0, totalBytes: 0, sentFiles: 0, files: 0 });
     setExtra(0);
     try {
       const folder = await opening;
-      const sent = await upload(folder, (now) => { setProgress(now); setExtra(now.files ? folder.sizes.size - now.files - 1 : 0); }, abort.current.signal);
+      const sent = await upload(folder, (now) => {
+        if (own.signal.aborted) return;
+        setProgress(now);
+        setExtra(now.files ? folder.sizes.size - now.files - 1 : 0);
+      }, own.signal);
       setDrive(sent);
     } catch (error) {
-      if (!abort.current.signal.aborted) setProblem(problemOf(error));
+      if (!own.signal.aborted) setProblem(problemOf(error));
+      own.abort(); // several files are sent at one time: none goes on behind the next upload
     }
   };
   const drop = (event: DragEvent): void => {
@@ -54,6 +61,22 @@ export function UploadPage(): Shown {
     ${problem && html`<${ProblemBox} problem=${problem} />`}
     ${progress && !problem && html`<${Steps} progress=${progress} extra=${extra} />`}
     ${drive && html`<p><a class="button primary" href=${link("drives", drive.id)}>Open ${drive.name}</a></p>`}`;
+}
+
+/** Files that are dropped beside the place for them would replace the page, and end its upload. */
+function keepPage(): () => void {
+  const over = (event: DragEvent): void => {
+    if (event.defaultPrevented) return;
+    event.preventDefault();
+    if (event.dataTransfer) event.dataTransfer.dropEffect = "none";
+  };
+  const drop = (event: DragEvent): void => event.preventDefault();
+  window.addEventListener("dragover", over);
+  window.addEventListener("drop", drop);
+  return () => {
+    window.removeEventListener("dragover", over);
+    window.removeEventListener("drop", drop);
+  };
 }
 
 function Steps({ progress, extra }: { progress: Progress; extra: number }): Shown {

@@ -1,19 +1,11 @@
 // Requests of an upload, which are made again where the service, or the way to it, was at fault.
-import { ProblemError, refusalOf } from "../client";
+import { mayPass, randomName, refusalOf, send } from "../client";
 
 const TRIES = 6;
-const PASSING = [0, 408, 423, 429]; // 0: no answer
-const IN_FLIGHT = "urn:mrasfm:problem:request-in-flight"; // the same request, whose answer was lost
 
 export async function require(answer: Response): Promise<Response> {
   if (answer.ok) return answer;
   throw await refusalOf(answer);
-}
-
-/** Whether the same request may succeed later. */
-export function mayPass(error: unknown): boolean {
-  if (!(error instanceof ProblemError)) return true;
-  return PASSING.includes(error.status) || error.status >= 500 || error.problem.type === IN_FLIGHT;
 }
 
 /** Tries of something, until it has gone on. */
@@ -44,4 +36,10 @@ export async function again<Value>(work: () => Promise<Value>, abort: AbortSigna
       await budget.pause(error);
     }
   }
+}
+
+/** Sends a request until it has an answer that counts; by its key a repetition is known. */
+export function sendAgain(method: string, path: string, abort: AbortSignal, text?: string): Promise<Response> {
+  const headers = method === "POST" ? { "Idempotency-Key": randomName() } : {};
+  return again(() => send(method, path, { headers, signal: abort, ...(text === undefined ? {} : { text }) }), abort);
 }

@@ -1,8 +1,8 @@
 // Large files in pieces, after tus 1.0.0. The service says where a file goes on: of a piece whose answer was lost, it
 // may have kept any part.
-import { getAll, ProblemError, randomName, refusalOf, type Drive, type Upload } from "../client";
+import { getAll, mayPass, ProblemError, randomName, refusalOf, type Drive, type Upload } from "../client";
 import type { Identified } from "./folder";
-import { again, mayPass, require, RetryBudget } from "./requests";
+import { again, require, RetryBudget } from "./requests";
 
 export const IN_PIECES = 8 << 20; // bytes from which on a file is sent so
 const PIECE = 8 << 20;
@@ -38,7 +38,7 @@ export async function sendInPieces(drive: Drive, one: Identified, sent: (bytes: 
 
 /** The upload of this file that another page, or another browser, has begun. */
 async function begun(uploads: string, { path, sha256 }: Identified, abort: AbortSignal): Promise<string | null> {
-  const found = (await getAll<Upload>(`${uploads}?sha256=${sha256}`, abort)).find((upload) => upload.path === path);
+  const found = (await again(() => getAll<Upload>(`${uploads}?sha256=${sha256}`, abort), abort)).find((upload) => upload.path === path);
   return found ? `${uploads}/${found.id}` : null;
 }
 

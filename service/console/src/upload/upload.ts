@@ -3,7 +3,7 @@ import { fileUrl, getAll, ProblemError, send, type Drive } from "../client";
 import { Hasher } from "./hashing";
 import { requireExpected } from "./archive";
 import { composed, MANIFEST, type Folder, type Identified } from "./folder";
-import { again, require } from "./requests";
+import { again, require, sendAgain } from "./requests";
 import { IN_PIECES, sendInPieces } from "./resumable";
 
 const AT_ONE_TIME = 4;
@@ -32,11 +32,11 @@ export async function upload(folder: Folder, say: (progress: Progress) => void, 
   const progress: Progress = { step: "creates", doneBytes: 0, totalBytes: 0, sentFiles: 0, files: 0 };
   say({ ...progress });
   const { drive, isNew } = await openDrive(manifest, abort);
-  const named = new Map((await getAll<DriveFile>(`v1/drives/${drive.id}/files`, abort)).map(({ path }) => [composed(path), path]));
+  const named = new Map((await again(() => getAll<DriveFile>(`v1/drives/${drive.id}/files`, abort), abort)).map(({ path }) => [composed(path), path]));
   try {
     requireComplete(folder, named);
   } catch (error) {
-    if (isNew) await send("DELETE", `v1/drives/${drive.id}`, { signal: abort });
+    if (isNew) await sendAgain("DELETE", `v1/drives/${drive.id}`, abort);
     throw error;
   }
   const size = (path: string): number => folder.sizes.get(path)!;
@@ -52,7 +52,7 @@ export async function upload(folder: Folder, say: (progress: Progress) => void, 
     say({ ...progress });
   }, abort);
   say({ ...progress, step: "commits" });
-  const committed = (await (await send("POST", `v1/drives/${drive.id}:commit`, { signal: abort })).json()) as Drive;
+  const committed = (await (await sendAgain("POST", `v1/drives/${drive.id}:commit`, abort)).json()) as Drive;
   say({ ...progress, step: "done" });
   return committed;
 }
@@ -67,12 +67,12 @@ function requireComplete(folder: Folder, named: ReadonlyMap<string, string>): vo
 
 /** The open drive of this manifest, or a new one. */
 async function openDrive(manifest: string, abort: AbortSignal): Promise<{ drive: Drive; isNew: boolean }> {
-  for (const drive of await getAll<Drive>("v1/drives", abort)) {
+  for (const drive of await again(() => getAll<Drive>("v1/drives", abort), abort)) {
     if (drive.state !== "OPEN") continue;
-    const stored = await (await send("GET", `v1/drives/${drive.id}/manifest`, { signal: abort })).text();
+    const stored = await (await sendAgain("GET", `v1/drives/${drive.id}/manifest`, abort)).text();
     if (stored === manifest) return { drive, isNew: false };
   }
-  const answer = await send("POST", "v1/drives", { text: manifest, signal: abort });
+  const answer = await sendAgain("POST", "v1/drives", abort, manifest);
   return { drive: (await answer.json()) as Drive, isNew: true };
 }
 
