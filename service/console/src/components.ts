@@ -1,6 +1,6 @@
 // Parts that all pages are made of.
 import { useEffect, useRef, useState } from "preact/hooks";
-import { ProblemError, type Finding, type Job, type Problem } from "./client";
+import { mayPass, ProblemError, type Finding, type Job, type Problem } from "./client";
 import { duration, moment } from "./format";
 import { html, type Children, type Shown } from "./html";
 import { epoch } from "./live";
@@ -12,7 +12,9 @@ export interface Loaded<Value> {
   again: () => void;
 }
 
-/** What `read` gives, read anew when `key` changes and, if `isLive`, when a job came or ended. */
+const AGAIN_MS = 3000;
+
+/** What `read` gives, read anew when `key` changes and, if `isLive`, when a job came or ended; also while it may come yet. */
 export function useLoad<Value>(read: (abort: AbortSignal) => Promise<Value>, key: string, isLive = true): Loaded<Value> {
   const [state, setState] = useState<{ key: string; value: Value | null; problem: Problem | null }>({
     key,
@@ -23,13 +25,19 @@ export function useLoad<Value>(read: (abort: AbortSignal) => Promise<Value>, key
   const at = isLive ? epoch.value : 0;
   useEffect(() => {
     const abort = new AbortController();
+    let timer: ReturnType<typeof setTimeout> | undefined;
     read(abort.signal).then(
       (value) => !abort.signal.aborted && setState({ key, value, problem: null }),
       (error: unknown) => {
-        if (!abort.signal.aborted) setState((before) => ({ key, value: before.key === key ? before.value : null, problem: problemOf(error) }));
+        if (abort.signal.aborted) return;
+        setState((before) => ({ key, value: before.key === key ? before.value : null, problem: problemOf(error) }));
+        if (error instanceof ProblemError && mayPass(error)) timer = setTimeout(() => setTurn((n) => n + 1), AGAIN_MS);
       },
     );
-    return () => abort.abort();
+    return () => {
+      abort.abort();
+      clearTimeout(timer);
+    };
   }, [key, at, turn]);
   const isCurrent = state.key === key;
   return { value: isCurrent ? state.value : null, problem: isCurrent ? state.problem : null, again: () => setTurn((n) => n + 1) };

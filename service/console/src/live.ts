@@ -1,6 +1,6 @@
 // Jobs as the stream tells of them, for all parts of the page.
 import { signal } from "@preact/signals";
-import { getShown, session, setSession, type Job } from "./client";
+import { get, getShown, identityOf, mayPass, ProblemError, session, setSession, type Job, type Session } from "./client";
 import type { Connection, FromPage, FromWorker } from "./messages";
 import { ProjectStream } from "./stream";
 
@@ -10,7 +10,8 @@ export const connection = signal<Connection>("connecting");
 export const epoch = signal(0);
 
 const ENDED = ["SUCCEEDED", "FAILED", "CANCELLED"];
-let tell: ((message: FromPage) => void) | null = null;
+const AGAIN_MS = 1000;
+let tell: ((type: FromPage["type"]) => void) | null = null;
 /** For each read of the list under way, oldest first: the jobs put since it began, which its answer may show as before. */
 const reads = new Set<Map<string, Job>>();
 
@@ -61,36 +62,50 @@ function hear(message: FromWorker): void {
     connection.value = "live";
     void readJobs();
   }
-  if (message.type === "end") setSession(null);
+  if (message.type === "end") void checkSession();
+}
+
+/** The stream ended with its session. Another page may have begun another one, which the cookie now stands for. */
+async function checkSession(): Promise<void> {
+  const before = identityOf(session.value);
+  try {
+    const now = await get<Session>("v1/session");
+    setSession(now);
+    if (identityOf(now) === before) tell?.(document.hidden ? "hidden" : "visible");
+  } catch (error) {
+    if (error instanceof ProblemError && mayPass(error)) setTimeout(() => void checkSession(), AGAIN_MS);
+    else setSession(null);
+  }
 }
 
 /** Follow the project until `unfollow`. */
 export function follow(): void {
   if (tell) return;
   tell = "SharedWorker" in window ? throughWorker() : alone();
-  tell({ type: document.hidden ? "hidden" : "visible" });
+  tell(document.hidden ? "hidden" : "visible");
   void readJobs();
 }
 
 export function unfollow(): void {
-  tell?.({ type: "leaves" });
+  tell?.("leaves");
   tell = null;
   reads.clear(); // whoever logs in next has other jobs
   jobs.value = null;
 }
 
-function throughWorker(): (message: FromPage) => void {
+function throughWorker(): (type: FromPage["type"]) => void {
+  const of = identityOf(session.value);
   const { port } = new SharedWorker(new URL("events.js", import.meta.url), { name: "mrasfm-events" });
   port.onmessage = ({ data }: MessageEvent<FromWorker>) => hear(data);
   port.start();
-  return (message) => port.postMessage(message);
+  return (type) => port.postMessage({ type, session: of } satisfies FromPage);
 }
 
-function alone(): (message: FromPage) => void {
+function alone(): (type: FromPage["type"]) => void {
   const stream = new ProjectStream("v1/", hear);
-  return (message) => (message.type === "visible" ? stream.open() : stream.close());
+  return (type) => (type === "visible" ? stream.open() : stream.close());
 }
 
-document.addEventListener("visibilitychange", () => tell?.({ type: document.hidden ? "hidden" : "visible" }));
-window.addEventListener("pagehide", () => tell?.({ type: "leaves" }));
-window.addEventListener("pageshow", (event) => event.persisted && tell?.({ type: "visible" }));
+document.addEventListener("visibilitychange", () => tell?.(document.hidden ? "hidden" : "visible"));
+window.addEventListener("pagehide", () => tell?.("leaves"));
+window.addEventListener("pageshow", (event) => event.persisted && tell?.("visible"));

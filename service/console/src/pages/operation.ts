@@ -1,4 +1,4 @@
-import { get, setSession, type Session, type Status } from "../client";
+import { get, send, setSession, type Session, type Status } from "../client";
 import { Badge, Content, Empty, Heading, Tile, Time, useLoad } from "../components";
 import { bytes, count, plural } from "../format";
 import { html, type Shown } from "../html";
@@ -69,6 +69,6 @@ mrasfm keys revoke ${shown.key_id}</pre>`}<//>
 }
 
 export async function logOut(): Promise<void> {
-  await fetch("v1/session", { method: "DELETE" });
+  await send("DELETE", "v1/session");
   setSession(null);
 }
