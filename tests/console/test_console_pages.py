@@ -15,6 +15,7 @@ from playwright.sync_api import Page, ViewportSize, expect
 from service.domain.keys import revoke_key
 from tests.console.conftest import MAP_FINDING, Open, World, go, log_in, wait_for
 from tests.helpers.slow import slow
+from tests.helpers.tiny_drive import tiny_drive
 
 WIDE: ViewportSize = {"width": 1280, "height": 800}
 NARROW: ViewportSize = {"width": 400, "height": 800}
@@ -260,3 +261,29 @@ def test_a_tile_url_adds_its_origin_and_no_other(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match="console_tiles"):
             settings_of(tmp_path, console_tiles=wrong)
+
+
+def test_a_form_that_is_sent_twice_makes_one_map(open_console: Open, world: World) -> None:
+    page, client = open_console(world.api.url).new_page(), world.api.client(max_active_jobs=20)
+    for name in ("a", "b"):
+        client.scene({"points.ply": b"ply"}, tiny_drive(name, seed=name))
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "drives")
+    for box in page.locator("tbody input[type=checkbox]").all():
+        box.check()
+    page.get_by_role("button", name="Make a map of 2 drives").dblclick()
+    wait_for(page, "location.hash.includes('jobs/')")
+    page.wait_for_timeout(500)
+    assert len(client.get("/v1/maps").json()["items"]) == 1
+
+
+def test_a_question_has_the_focus(open_console: Open, world: World) -> None:
+    """The button that was pressed is gone: somebody with a keyboard would begin at the top of the page."""
+    page = open_console(world.api.url).new_page()
+    log_in(page, world.api.url, world.client.key)
+    go(page, world.api.url, f"drives/{world.drive_id}")
+    page.get_by_role("button", name="Delete").focus()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="No")).to_be_focused()
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("button", name="Delete")).to_be_focused()

@@ -144,6 +144,11 @@ export function Time({ at }: { at: string | null | undefined }): Shown {
 export function Confirm({ label, ask, run, danger = false }: { label: string; ask: string; run: () => Promise<void>; danger?: boolean }): Shown {
   const [step, setStep] = useState<"idle" | "asks" | "runs">("idle");
   const [problem, setProblem] = useState<Problem | null>(null);
+  const focused = useRef<HTMLButtonElement>(null);
+  const wasPressed = useRef(false);
+  useEffect(() => {
+    if (wasPressed.current) focused.current?.focus(); // the button that had the focus is gone
+  }, [step]);
   const doIt = async (): Promise<void> => {
     setStep("runs");
     setProblem(null);
@@ -154,12 +159,16 @@ export function Confirm({ label, ask, run, danger = false }: { label: string; as
     }
     setStep("idle");
   };
+  const begin = (): void => {
+    wasPressed.current = true;
+    setStep("asks");
+  };
   return html`<span class="confirm">
-    ${step === "idle" && html`<button type="button" class=${danger ? "danger" : ""} onClick=${() => setStep("asks")}>${label}</button>`}
+    ${step === "idle" && html`<button type="button" class=${danger ? "danger" : ""} ref=${focused} onClick=${begin}>${label}</button>`}
     ${step === "asks" &&
     html`<span role="group" aria-label=${ask}><span>${ask}</span>
-      <button type="button" class=${danger ? "danger" : "primary"} onClick=${() => void doIt()}>Yes</button>
-      <button type="button" onClick=${() => setStep("idle")}>No</button></span>`}
+      <button type="button" class=${danger ? "danger" : "primary"} ref=${danger ? undefined : focused} onClick=${() => void doIt()}>Yes</button>
+      <button type="button" ref=${danger ? focused : undefined} onClick=${() => setStep("idle")}>No</button></span>`}
     ${step === "runs" && html`<button type="button" disabled>${label} …</button>`}
     ${problem && html`<${ProblemBox} problem=${problem} />`}
   </span>`;

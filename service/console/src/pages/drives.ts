@@ -16,7 +16,7 @@ export function Drives(): Shown {
       drives.length === 0
         ? html`<${Empty}><p>No drive yet.</p><p>A drive is a folder with <code>drive.json</code> and its images.
             <a href=${link("upload")}>Upload one here</a>, or with <code>mrasfm upload FOLDER</code>.</p><//>`
-        : html`${chosen.length > 1 && html`<${MakeMap} drives=${drives.filter((drive) => chosen.includes(drive.id))} />`}
+        : html`<${Chosen} drives=${drives.filter((drive) => chosen.includes(drive.id))} />
             <${DriveTable} drives=${drives} chosen=${chosen} choose=${choose} />`}<//>`;
 }
 
@@ -43,11 +43,18 @@ function DriveTable({ drives, chosen, choose }: { drives: readonly Drive[]; chos
   </table></div>`;
 }
 
+function Chosen({ drives }: { drives: readonly Drive[] }): Shown {
+  return drives.length > 1 ? html`<${MakeMap} drives=${drives} />` : null;
+}
+
 function MakeMap({ drives }: { drives: readonly Drive[] }): Shown {
   const [name, setName] = useState("map");
   const [problem, setProblem] = useState<Problem | null>(null);
+  const [isBusy, setBusy] = useState(false);
   const make = async (event: Event): Promise<void> => {
     event.preventDefault();
+    setBusy(true);
+    setProblem(null);
     try {
       const answer = await send("POST", "v1/aggregations", { json: { drives: drives.map((drive) => drive.id), name } });
       const job = (await answer.json()) as Job;
@@ -56,10 +63,11 @@ function MakeMap({ drives }: { drives: readonly Drive[] }): Shown {
     } catch (error) {
       setProblem(problemOf(error));
     }
+    setBusy(false);
   };
   return html`<form class="box inline" onSubmit=${(event: Event) => void make(event)}>
     <label>Name of the map <input required maxlength="200" value=${name} onInput=${(event: Event) => setName((event.target as HTMLInputElement).value)} /></label>
-    <button class="primary">Make a map of ${drives.length} drives</button>
+    <button class="primary" disabled=${isBusy}>Make a map of ${drives.length} drives</button>
     ${problem && html`<${ProblemBox} problem=${problem} />`}
   </form>`;
 }

@@ -54,10 +54,12 @@ function Ask({ base, components, asked }: { base: string; components: readonly C
   const [component, setComponent] = useState(0);
   const [crs, setCrs] = useState("");
   const [problem, setProblem] = useState<Problem | null>(null);
+  const [isBusy, setBusy] = useState(false);
   const parts = apart(components);
   const choose = (name: ExportFormat, isChosen: boolean): void => setFormats(isChosen ? [...formats, name] : formats.filter((other) => other !== name));
   const ask = async (event: Event): Promise<void> => {
     event.preventDefault();
+    setBusy(true);
     setProblem(null);
     const json: ExportRequest = { formats: [...formats], crs: crs || null, component: component || null };
     try {
@@ -66,6 +68,7 @@ function Ask({ base, components, asked }: { base: string; components: readonly C
     } catch (error) {
       setProblem(problemOf(error));
     }
+    setBusy(false);
   };
   return html`<form class="box" onSubmit=${(event: Event) => void ask(event)}>
     <fieldset class="options"><legend>Formats</legend>
@@ -78,7 +81,7 @@ function Ask({ base, components, asked }: { base: string; components: readonly C
           <option value="0">The scene itself</option>
           ${parts.map(([number, part]) => html`<option value=${number}>Component ${part.component}: ${plural(part.registered_units, "unit")}</option>`)}</select></label>`}
       <label>Coordinate reference system <input size="12" placeholder="the format's own" pattern=${CRS} title="as EPSG:25832" value=${crs} onInput=${(event: Event) => setCrs((event.target as HTMLInputElement).value.trim())} /></label>
-      <button class="primary" disabled=${formats.length === 0}>Export</button>
+      <button class="primary" disabled=${formats.length === 0 || isBusy}>Export</button>
     </div>
     ${problem && html`<${ProblemBox} problem=${problem} />`}
   </form>`;
