@@ -287,3 +287,25 @@ def test_a_question_has_the_focus(open_console: Open, world: World) -> None:
     expect(page.get_by_role("button", name="No")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.get_by_role("button", name="Delete")).to_be_focused()
+
+
+def test_a_long_name_leaves_a_list_its_columns(open_console: Open, world: World) -> None:
+    """One name without a space pushed all columns of a list out of sight."""
+    page, client = open_console(world.api.url, viewport=WIDE).new_page(), world.api.client()
+    long = "W" * 200
+    client.scene({"points.ply": b"ply"}, tiny_drive(long, seed="long"))
+    log_in(page, world.api.url, client.key)
+    for address in ("drives", "scenes", "jobs"):
+        go(page, world.api.url, address)
+        page.get_by_text(long).first.wait_for()
+        table = page.locator(".scroll")
+        assert table.evaluate("one => one.scrollWidth - one.clientWidth") <= 0, address
+
+
+def test_a_job_of_many_drives_names_some_of_them(open_console: Open, world: World) -> None:
+    page, client = open_console(world.api.url).new_page(), world.api.client(max_active_jobs=50)
+    drives = [client.frozen(tiny_drive(f"drive-{i}", seed=f"some {i}")) for i in range(7)]
+    client.aggregate(drives=drives, name="many")
+    log_in(page, world.api.url, client.key)
+    go(page, world.api.url, "jobs")
+    page.get_by_text("drive-0, drive-1, drive-2, drive-3, drive-4 and 2 more").wait_for()

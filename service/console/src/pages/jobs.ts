@@ -7,6 +7,7 @@ import { hasEnded, jobs, put } from "../live";
 import { go, link } from "../router";
 
 const SHOWN = 200;
+const NAMED = 5; // drives of a map, in a list of jobs
 const PERIODS = { active: "Not ended", failed: "Failed", all: "All" } as const;
 type Period = keyof typeof PERIODS;
 
@@ -51,7 +52,9 @@ export function JobTable({ jobs: shown }: { jobs: readonly Job[] }): Shown {
 }
 
 function nameOf(job: Job, drives: readonly Drive[] | null): string {
-  if (job.members && job.members.length > 0) return job.members.map((member) => member.name).join(", ");
+  const members = (job.members ?? []).map((member) => member.name);
+  const more = members.length - NAMED;
+  if (members.length > 0) return members.slice(0, NAMED).join(", ") + (more > 0 ? ` and ${more} more` : "");
   return drives?.find((drive) => drive.id === job.drive_id)?.name ?? job.drive_id ?? job.id;
 }
 
