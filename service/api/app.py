@@ -223,8 +223,10 @@ def _answer_errors(app: FastAPI) -> None:
         if any(words in str(error) for words in _DATABASE_FULL):
             return problem_response(_disk_full())
         log.error("the database does not answer", exc_info=error)
-        detail = "the request could not be recorded, and had no effect"
-        remedy, headers = "Repeat it in some seconds.", {"Retry-After": "5"}
+        # What it was sent last, it may commit after the connection broke.
+        detail = "the database does not answer: the request was recorded as a whole, or not at all"
+        remedy = "Repeat it in some seconds, with the same Idempotency-Key if it had one."
+        headers = {"Retry-After": "5"}
         return problem_response(DatabaseUnavailable(detail, remedy=remedy, headers=headers))
 
 

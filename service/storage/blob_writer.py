@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.orm import Session
 
 from service.database.connections import Database
@@ -89,10 +90,18 @@ def _find(database: Database, project_id: str, sha256: str) -> Blob | None:
         return blobs.find(session, project_id, sha256)
 
 
+def _may_be_recorded_yet(error: BaseException | None) -> bool:
+    """Return whether a block ended because the database gave no answer, perhaps to a commit that goes on there."""
+    if not isinstance(error, DBAPIError):
+        return False
+    return error.connection_invalidated or isinstance(error, (OperationalError, InterfaceError))
+
+
 class BlobWriter:
     """Stores files that are recorded within its block, and takes back at its end what was not recorded.
 
-    A request that is refused after its bytes were stored, for a quota or a conflict, leaves nothing behind.
+    A request that is refused after its bytes were stored, for a quota or a conflict, leaves nothing behind. Where the
+    database went away, all stays: a server may commit what it was sent after the connection broke.
 
     Parameters
     ----------
@@ -112,7 +121,9 @@ class BlobWriter:
     def __enter__(self) -> BlobWriter:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if _may_be_recorded_yet(error):
+            return  # the reconciler collects them, once it is known that nothing names them
         with contextlib.suppress(Exception):  # else the reconciler collects them
             self._rollback()
 

@@ -12,6 +12,7 @@ from typing import Any
 import httpx
 import pytest
 from sqlalchemy import delete, func, insert, select, update
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from service.database.connections import Database
@@ -341,3 +342,18 @@ def test_files_that_take_longer_than_the_grace_are_recorded(
         store.used()
     with database.read() as session:
         assert session.scalars(select(Blob.key)).all() == [stored[0].key]
+
+
+def test_an_object_whose_recording_has_no_answer_stays(
+    database: Database, artifacts: ArtifactStore, database_settings: Settings, project_id: str
+) -> None:
+    """A server may commit after the connection broke: the blob would name an object that is gone."""
+    spooled = SpoolWriter(database_settings.spool_dir, min_free_bytes=0).finish(b"bytes")
+    writer = BlobWriter(database, artifacts, project_id=project_id, durable=False)
+    stored = writer(spooled.path, sha256=spooled.sha256, size_bytes=spooled.size_bytes)
+    lost = OperationalError("COMMIT", None, ConnectionResetError(), connection_invalidated=True)
+    with pytest.raises(OperationalError), writer:
+        raise lost
+    with database.write() as session:
+        blobs.record(session, project_id=project_id, **stored.identity)
+    assert artifacts.sha256_of(stored.key) == spooled.sha256
