@@ -126,3 +126,29 @@ def test_an_address_that_was_cut_or_is_none_is_said_to_be(open_console: Open, wo
         page.goto("about:blank")
         page.goto(f"{world.api.url}/#/{address}")
         expect(page.get_by_role("alert")).to_be_visible()
+
+
+def test_a_service_that_answers_with_errors_is_asked_in_peace(open_console: Open, world: World) -> None:
+    """As while its database is away: each page asked a hundred times a second, and said that it polls."""
+    watched = open_console(world.api.url)
+    watched.expected = ("503",)
+    page = watched.new_page()
+    page.add_init_script("delete window.SharedWorker")  # its requests cannot be answered here
+    log_in(page, world.api.url, world.client.key)
+    page.locator("[data-connection=live]").wait_for()
+    asked: list[str] = []
+
+    def refuse(route: Route) -> None:
+        asked.append(route.request.url)
+        route.fulfill(status=503, body=json.dumps(AWAY), content_type="application/problem+json")
+
+    for address in ("**/v1/events", "**/v1/jobs?*"):
+        page.route(address, refuse)
+    page.reload()
+    page.locator("[data-connection=offline]").wait_for()
+    page.wait_for_timeout(4000)
+    assert 3 <= len(asked) < 10
+    expect(page.locator("[data-connection]")).to_have_attribute("data-connection", "offline")
+    for address in ("**/v1/events", "**/v1/jobs?*"):
+        page.unroute(address)
+    page.locator("[data-connection=live]").wait_for()

@@ -6,11 +6,13 @@ import type { Connection, FromWorker } from "./messages";
 const POLL_MS = 3000;
 const GRACE_MS = 4000; // a stream that reconnects at once needs no polling
 const CLOSED = 2;
+const NOT_MODIFIED = 304;
 
 export class ProjectStream {
   private source: EventSource | null = null;
   private timer: ReturnType<typeof setTimeout> | undefined;
   private etag = "";
+  private isDown = false; // since the stream's last start, there was a poll
 
   constructor(
     private readonly api: string,
@@ -23,11 +25,17 @@ export class ProjectStream {
 
   open(): void {
     if (this.source) return;
+    this.isDown = false;
     this.connection("connecting");
+    this.listen();
+  }
+
+  private listen(): void {
     const source = new EventSource(`${this.api}events`);
     this.source = source;
     source.addEventListener("ready", () => {
       this.stopPolling();
+      this.isDown = false;
       this.connection("live");
       this.say({ type: "ready" });
     });
@@ -55,7 +63,7 @@ export class ProjectStream {
 
   private fallBack(source: EventSource): void {
     if (source !== this.source || this.timer !== undefined) return;
-    this.connection("connecting");
+    if (!this.isDown) this.connection("connecting");
     this.timer = setTimeout(() => void this.poll(), source.readyState === CLOSED ? 0 : GRACE_MS);
   }
 
@@ -74,16 +82,19 @@ export class ProjectStream {
         this.etag = answer.headers.get("etag") ?? "";
         this.say({ type: "jobs", jobs: ((await answer.json()) as Page<Job>).items });
       }
-      this.connection("polling");
+      this.connection(answer.ok || answer.status === NOT_MODIFIED ? "polling" : "offline");
     } catch {
       this.connection("offline");
     }
     if (this.source !== source || source === null) return;
-    if (source.readyState === CLOSED) {
-      this.close(); // a browser gives up where a proxy answered in the service's place
-      this.open();
-      return;
-    }
-    this.timer = setTimeout(() => void this.poll(), POLL_MS);
+    this.isDown = true;
+    this.timer = setTimeout(() => this.again(source), POLL_MS);
+  }
+
+  /** A browser gives up where the service, or a proxy in its place, answered with an error: it is asked anew, not at once. */
+  private again(source: EventSource): void {
+    if (source.readyState !== CLOSED) return void this.poll();
+    this.stopPolling();
+    this.listen();
   }
 }

@@ -36,7 +36,7 @@ export async function upload(folder: Folder, say: (progress: Progress) => void, 
   try {
     requireComplete(folder, named);
   } catch (error) {
-    if (isNew) await sendAgain("DELETE", `v1/drives/${drive.id}`, abort);
+    if (isNew) await sendAgain("DELETE", `v1/drives/${drive.id}`, abort).catch(() => null); // what is wrong with the folder matters more
     throw error;
   }
   const size = (path: string): number => folder.sizes.get(path)!;

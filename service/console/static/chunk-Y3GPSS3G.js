@@ -1,4 +1,4 @@
-import{b as a,z as r}from"./chunk-LXQZSSKF.js";function f({before:i,after:n,label:e}){let[t,s]=a(50);return r`<figure class="slider">
+import{b as a,z as r}from"./chunk-5IVFLYQX.js";function f({before:i,after:n,label:e}){let[t,s]=a(50);return r`<figure class="slider">
     <div class="stack">
       <img src=${i} alt=${`${e}, before`} loading="lazy" />
       <img src=${n} alt=${`${e}, after`} loading="lazy" style=${{clipPath:`inset(0 0 0 ${t}%)`}} />
