@@ -12,8 +12,12 @@ import axe_playwright_python
 import pytest
 from playwright.sync_api import Page, ViewportSize, expect
 
+from schemas.api.problems import Problem
+from service.database.tables import Drive
+from service.domain import jobs
 from service.domain.keys import revoke_key
 from tests.console.conftest import MAP_FINDING, Open, World, go, log_in, wait_for
+from tests.helpers.live_api import ONE_ATTEMPT
 from tests.helpers.slow import slow
 from tests.helpers.tiny_drive import tiny_drive
 
@@ -309,3 +313,24 @@ def test_a_job_of_many_drives_names_some_of_them(open_console: Open, world: Worl
     log_in(page, world.api.url, client.key)
     go(page, world.api.url, "jobs")
     page.get_by_text("drive-0, drive-1, drive-2, drive-3, drive-4 and 2 more").wait_for()
+
+
+def test_a_long_name_in_a_finding_or_problem_stays_on_the_page(open_console: Open, world: World) -> None:
+    page, client = open_console(world.api.url, viewport=NARROW).new_page(), world.api.client()
+    long = f"images/{'front_left_' * 12}.png"
+    drive_id = client.frozen(tiny_drive("finding", seed="finding"))
+    finding = {"severity": "warning", "code": "dark", "what": f"{long} is dark", "remedy": f"Look at {long}."}
+    job = client.reconstruct(drive_id)
+    problem = Problem(
+        type="urn:mrasfm:problem:bad-input", title="It failed", status=None, detail=f"{long} is dark", remedy="Look."
+    )
+    with world.api.database.write() as session:
+        session.get_one(Drive, drive_id).findings = [finding]
+        held = jobs.claim(session, job["id"], owner="worker@test", lease_us=60_000_000)
+        assert held is not None
+        jobs.fail(session, held, problem, limits=ONE_ATTEMPT, retry_delay_us=0)
+    log_in(page, world.api.url, client.key)
+    for address in (f"drives/{drive_id}", f"jobs/{job['id']}"):
+        go(page, world.api.url, address)
+        page.get_by_text(f"{long} is dark").first.wait_for()
+        assert page.evaluate("document.documentElement.scrollWidth") <= NARROW["width"], address
