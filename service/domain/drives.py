@@ -298,7 +298,8 @@ def remove(session: Session, project_id: str, drive_id: str) -> Named:
     needing = [job.id for job in active if job.kind not in (JobKind.PREFLIGHT, JobKind.SUBMAP)]
     if needing:
         by = f"{len(needing)} jobs: {', '.join(needing[:3])}" if len(needing) > 1 else f"job {needing[0]}"
-        raise DriveInUse(f"drive {drive.id} is needed by {by}", remedy="Wait until nothing needs it, or cancel what does.")
+        remedy = "Wait until nothing needs it, or cancel what does."
+        raise DriveInUse(f"drive {drive.id} is needed by {by}", remedy=remedy)
     require_unused(session, what=f"drive {drive.id}", drive_id=drive.id)
     for job in active:
         jobs.request_cancel(session, job.id)
