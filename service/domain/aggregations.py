@@ -202,7 +202,7 @@ def _require_once(plan: _Plan, drive_id: str, what: str) -> None:
 def _require_different_recordings(session: Session, plan: _Plan) -> None:
     """A recording that was uploaded twice would do the same."""
     coming = {*plan.scenes, *(drive.id for drive in plan.drives)}
-    same = drives_of_one_recording(session, coming | plan.remaining_drives)
+    same = drives_of_one_recording(session, coming, plan.remaining_drives)
     if same is None:
         return
     a, b = same

@@ -13,14 +13,21 @@ from service.database.tables import Blob, Drive, DriveFile
 _BATCH = 500
 
 
-def drives_of_one_recording(session: Session, drive_ids: Collection[str]) -> tuple[Drive, Drive] | None:
+def drives_of_one_recording(
+    session: Session, coming: Collection[str], present: Collection[str] = ()
+) -> tuple[Drive, Drive] | None:
     """The first two of some committed drives whose images have the same contents, whatever their manifests say.
 
     Contents are compared only between drives of equally many files and bytes: the files of a map's drives may be
-    millions. Drives with the same images and other masks are not found so, an aggregation tells them apart later.
+    millions. Drives with the same images and other masks are not found so, an aggregation refuses them later.
+
+    Parameters
+    ----------
+    coming, present
+        Ids of the drives. One of the two is coming at least: what a map has, it keeps.
     """
     alike: dict[tuple[int, int, int | None, int | None], list[Drive]] = {}
-    for drive in sorted(_drives(session, sorted(drive_ids)), key=lambda drive: (drive.created_us, drive.id)):
+    for drive in sorted(_drives(session, sorted({*coming, *present})), key=lambda drive: (drive.created_us, drive.id)):
         size = drive.cameras, drive.frames, drive.files_stored, drive.bytes_stored
         alike.setdefault(size, []).append(drive)
     for drives in alike.values():
@@ -28,7 +35,7 @@ def drives_of_one_recording(session: Session, drive_ids: Collection[str]) -> tup
         for drive in drives if len(drives) > 1 else ():
             contents = _contents(session, drive)
             first = first_with.setdefault(contents, drive)
-            if contents and first is not drive:
+            if contents and first is not drive and not {first.id, drive.id}.isdisjoint(coming):
                 return first, drive
     return None
 

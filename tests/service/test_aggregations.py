@@ -340,6 +340,15 @@ def test_one_recording_that_was_uploaded_twice(client: Client, drives: list[str]
     assert {member["drive_id"] for member in job["members"]} == {drives[1], again}
 
 
+def test_drives_that_are_in_the_map_already_stay_there(client: Client, drives: list[str]) -> None:
+    again = client.frozen(tiny_drive("again", seed=f"{client.project_id}0"))
+    with client.api.database.read() as session:
+        assert drives_of_one_recording(session, drives[1:], [drives[0], again]) is None
+        found = drives_of_one_recording(session, [again], drives)
+    assert found is not None
+    assert [drive.id for drive in found] == [drives[0], again]
+
+
 def test_drives_of_the_same_size_are_of_different_recordings(client: Client) -> None:
     files = {name: tiny_drive(seed=f"{client.project_id} {name}") for name in ("a", "b")}
     drives = [client.frozen(drive) for drive in files.values()]
