@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from mrasfm_engine.errors import InputError
-from schemas.drive import MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
+from schemas.drive import MAX_GNSS_GAP_S, MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
 from schemas.findings import enumerated
 from schemas.methods import ExtractorName, MatcherName
 from schemas.misspelt import correction_of
@@ -262,7 +262,7 @@ class GnssConfig(_Section):
     outlier_sigmas: Positive = Field(
         4.0, description="samples whose residual after alignment exceeds this are rejected, in standard deviations"
     )
-    max_time_gap_s: Positive = Field(2.0, description="positions are not interpolated across larger gaps")
+    max_time_gap_s: Positive = Field(MAX_GNSS_GAP_S, description="positions are not interpolated across larger gaps")
 
 
 class AggregationConfig(_Section):

@@ -57,6 +57,7 @@ MAX_RIG_EXTENT_M = 100.0  # a camera or antenna farther from the rig's origin th
 # The longest rigid road vehicle, a bus of three axles (directive 96/53/EC, annex I): a rig does not bend, so that
 # cameras of one are no farther apart. Rails and mines have longer ones.
 LONGEST_VEHICLE_M = 15.0
+MAX_GNSS_GAP_S = 2.0  # between two samples, in which positions are interpolated where settings say nothing else
 SIGMA_TRANSLATION_M = 0.05  # of a camera's place on the vehicle where the manifest declares none
 MAX_READOUT_US = 200_000  # slower than any camera reads its rows: nanoseconds
 MAX_SIGMA_TIME_OFFSET_US = 1_000_000

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import DriveManifest, Gnss
+from schemas.drive import MAX_GNSS_GAP_S, DriveManifest, Gnss
 from schemas.findings import Finding, error, listed, warning
 
 # Between GPS time and UTC: 18 s since 2017; a neighbouring value betrays an old table of leap seconds.
@@ -15,7 +15,6 @@ JUMP_SIGMAS = 4.0
 # Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
 EXTRAPOLATED_SAMPLES = 1.5
 MAX_EXTRAPOLATION_US = 2_000_000
-MAX_GAP_US = 2_000_000  # between two samples, in which positions are interpolated: `gnss.max_time_gap_s` by default
 SEA_DEG = (np.pi / 2, np.pi)  # latitude and longitude off 0, 0 up to which there is no land; all radians are there
 WGS84_A_M, WGS84_E2 = 6_378_137.0, 6.69437999014e-3  # semi-major axis, first eccentricity squared
 
@@ -152,14 +151,14 @@ def _check_gaps(images: Ints, times: Ints) -> list[Finding]:
     """The finding that most images lie between samples that are far apart, as where timestamps have another unit."""
     after = np.clip(np.searchsorted(times, images), 1, max(len(times) - 1, 1))
     gaps_us = np.diff(times)[after - 1] if len(times) > 1 else np.zeros(len(images), dtype=np.int64)
-    lost = (gaps_us > MAX_GAP_US) & ~np.isin(images, times)
+    lost = (gaps_us > MAX_GNSS_GAP_S * 1e6) & ~np.isin(images, times)
     if lost.mean() <= 0.5:
         return []
     return [
         warning(
             "gnss-sparse",
             f"{int(lost.sum())} of {len(images)} images lie between gnss.samples that are over "
-            f"{MAX_GAP_US / 1e6:.0f} s apart, by up to {gaps_us.max() / 1e6:.3g} s: they have no position",
+            f"{MAX_GNSS_GAP_S:.0f} s apart, by up to {gaps_us.max() / 1e6:.3g} s: they have no position",
             "Check that timestamp_us of gnss.samples are microseconds. Of a receiver that comes so seldom, samples at "
             "the times of images count.",
         )

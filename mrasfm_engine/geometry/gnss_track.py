@@ -16,6 +16,7 @@ MIN_NEIGHBOURS, ENOUGH_NEIGHBOURS = 4, 6  # of both sides, so that one that is w
 USUAL_SPAN_S, NEIGHBOUR_SPAN_S = 0.5, 3.0  # on each side: where that holds enough of them, and at most
 MIN_JUMP_M = 2.0  # a smaller disagreement is left to the robust losses
 HARDEST_MPS2 = 10.0  # a vehicle accelerates and brakes by less
+ACCELERATION_SIGMA_MPS2 = HARDEST_MPS2 / 2.0  # the hardest is two sigmas
 BRAKING_S, HELD_SIGMAS = 1.0, 3.0  # before a receiver's last positions, which are all the same
 HEADING_WINDOWS_S = (0.5, 1.0, 2.0, 4.0, 8.0)  # half widths tried, the narrowest that shows a direction is used
 # Of roll, pitch, and the heading against the antenna's track: roads climb by up to 10 % and lean by some per cent, and

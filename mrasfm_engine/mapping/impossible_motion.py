@@ -10,14 +10,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mrasfm_engine.geometry.gnss_track import HARDEST_MPS2
+from mrasfm_engine.geometry.gnss_track import ACCELERATION_SIGMA_MPS2
 from mrasfm_engine.geometry.local_motion import MAX_GAP_S
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.types import Floats, Ints
 from schemas.findings import Finding, error
 
 MIN_STEPS = 4  # of which some tell how exactly positions follow one another
-NORMAL_MAD = 1.4826  # sigmas of a normal distribution in its median absolute deviation
+NORMAL_MAD = 1.4826  # sigmas of a normal error in the median of its absolute value: most of it is along the way
 IMPOSSIBLE_SIGMAS = 4.0
 
 
@@ -42,7 +42,7 @@ def find_jumps(time_s: Floats, position_m: Floats) -> Jumps:
     Notes
     -----
     A step with the mean velocity of its neighbours is off by half the acceleration times the product of the times to
-    both, of which the hardest is two sigmas as in `RigMotion.expected_sigma_m`. Positions err besides, which most steps
+    both, as in `RigMotion.expected_sigma_m`. Positions err besides, which most steps
     tell: as the median of what they are off.
     """
     none = Jumps(unit=np.zeros(0, dtype=np.int64), distance_m=np.zeros(0))
@@ -52,7 +52,7 @@ def find_jumps(time_s: Floats, position_m: Floats) -> Jumps:
     velocity = np.diff(position_m, axis=0) / elapsed_s[:, None]
     around_s = np.stack([elapsed_s[:-2], elapsed_s[1:-1], elapsed_s[2:]])
     off_m = elapsed_s[1:-1] * np.linalg.norm(velocity[1:-1] - 0.5 * (velocity[:-2] + velocity[2:]), axis=1)
-    by_motion_m = 0.5 * (HARDEST_MPS2 / 2.0) * elapsed_s[1:-1] * around_s.sum(0)
+    by_motion_m = 0.5 * ACCELERATION_SIGMA_MPS2 * elapsed_s[1:-1] * around_s.sum(0)
     sigma_m = np.hypot(by_motion_m, NORMAL_MAD * np.median(off_m))
     jumped = np.flatnonzero((off_m > IMPOSSIBLE_SIGMAS * sigma_m) & (around_s.max(0) <= MAX_GAP_S))
     # The steps beside a jump have it as their neighbour: of a run, the one that is off most.
@@ -61,7 +61,7 @@ def find_jumps(time_s: Floats, position_m: Floats) -> Jumps:
     return Jumps(unit=rows + 2, distance_m=off_m[rows])
 
 
-def jump_findings(mapper: Mapper) -> list[Finding]:
+def motion_jump_findings(mapper: Mapper) -> list[Finding]:
     """Say where the scene's trajectory jumps."""
     units = np.flatnonzero(mapper.registered)
     time_s = mapper.drive.timestamps_us[units] / 1e6

@@ -14,7 +14,7 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.problem import RowBandMotion
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.gnss_track import HARDEST_MPS2
+from mrasfm_engine.geometry.gnss_track import ACCELERATION_SIGMA_MPS2
 from mrasfm_engine.geometry.local_motion import (
     MAX_GAP_S,
     LocalMotion,
@@ -169,7 +169,7 @@ class RigMotion:
         A line through two places of a path is off by half the acceleration times the product of the times to both.
         """
         to_both_s = self._time_s[self._nearest_two(registered, unit)] - self._time_s[unit]
-        return 0.5 * (HARDEST_MPS2 / 2.0) * float(np.abs(to_both_s).prod())
+        return 0.5 * ACCELERATION_SIGMA_MPS2 * float(np.abs(to_both_s).prod())
 
     def _nearest_two(self, registered: Bools, unit: int) -> Ints:
         """The two other registered units that are nearest in time; fewer where there are fewer."""

@@ -14,9 +14,10 @@ from mrasfm_engine.export.colmap import approximations
 from mrasfm_engine.io.packed_scene import pack_scene, unpack_scene
 from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.io.stage_store import Arrays
-from mrasfm_engine.mapping import gaps, impossible_motion, mapping_report, miscalibration
+from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.implausible_lengths import length_findings
+from mrasfm_engine.mapping.impossible_motion import motion_jump_findings
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.receiver_findings import (
@@ -164,7 +165,7 @@ def _refined(
         findings.append(miscalibration.pair_finding(names, refined.wrong_pair))
     findings += mapping_report.idle_camera_findings(mapper)
     findings += mapping_report.contradicting_image_findings(mapper)
-    findings += mapping_report.motion_findings(mapper) + impossible_motion.jump_findings(mapper)
+    findings += mapping_report.motion_findings(mapper) + motion_jump_findings(mapper)
     findings += mapping_report.scale_findings(mapper, refined) + length_findings(mapper, refined)
     report = {
         **mapping_report.describe_refinement(mapper, refined),

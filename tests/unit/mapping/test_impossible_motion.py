@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.mapping.impossible_motion import find_jumps, jump_findings
+from mrasfm_engine.mapping.impossible_motion import find_jumps, motion_jump_findings
 from mrasfm_engine.types import Floats
 from tests.unit.mapping.test_road_filter import drive_over_shadows, mapped
 
@@ -55,9 +55,9 @@ def test_few_units_tell_nothing(units: int) -> None:
 
 def test_a_scene_that_jumps_is_an_error_that_names_the_frames() -> None:
     mapper = mapped(drive_over_shadows(share=0.0)[0])
-    assert jump_findings(mapper) == []
+    assert motion_jump_findings(mapper) == []
     units = np.flatnonzero(mapper.registered)
     mapper.state.unit_position_m[units[len(units) // 2 :]] -= [PERIOD_M, 0.0, 0.0]
-    (said,) = jump_findings(mapper)
+    (said,) = motion_jump_findings(mapper)
     assert (said.code, said.severity) == ("impossible-motion", "error")
     assert f"between frames {units[len(units) // 2 - 1]} and {units[len(units) // 2]}" in said.what
