@@ -33,6 +33,7 @@ from mrasfm_engine.mapping.incremental_mapping import (
 from mrasfm_engine.mapping.loop_closure import MIN_SUPPORT, largest_agreement, seen_again, split_pairs
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import move, place_by_gnss, positions_fit
+from mrasfm_engine.mapping.places_alike import SoundPairs, sound_pairs
 from mrasfm_engine.mapping.rough_placement import between_poses, place_by_rough_poses
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
@@ -123,13 +124,16 @@ def begin_mapping(
     cancel: Cancel | None = None,
 ) -> DriveMapping:
     """Mapping of a drive of which nothing has a pose yet."""
-    near, far = split_pairs(pairs)
+    following, far = split_pairs(pairs)
+    alike = sound_pairs(drive, keypoints, following, config, cancel)
+    near = alike.pairs
     mapper, still, contradiction = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
     return DriveMapping(
         mapper=mapper,
         still=still,
         near=near,
         far=far,
+        alike=alike,
         sound=without_keypoints(near, keypoints.first, still) if still.any() else near,
         prior_world_from_rig=prior_world_from_rig,
         absolute=AbsolutePriors() if absolute is None else absolute,
@@ -151,6 +155,8 @@ class DriveMapping:
         Keypoints (k,) that stand still in the image while the car moves.
     near, far
         Pairs of units that follow one another, and of those that may be revisits.
+    alike
+        What became of the former where places look alike.
     sound
         Those of `near` without the keypoints that stand still.
     contradiction
@@ -163,6 +169,7 @@ class DriveMapping:
     still: Bools
     near: Sequence[PairMatches]
     far: Sequence[PairMatches]
+    alike: SoundPairs
     sound: Sequence[PairMatches]
     prior_world_from_rig: Floats | None
     absolute: AbsolutePriors
@@ -213,7 +220,7 @@ class DriveMapping:
             if not result or part.size >= MIN_UNITS:
                 taken |= part.mapper.registered
                 result.append(part)
-        result[0].log.contradiction = self.contradiction
+        result[0].log.contradiction, result[0].log.alike = self.contradiction, self.alike
         return result
 
 

@@ -34,7 +34,7 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
     result = []
     drive, whole = parts[0].mapper.drive, parts[0].mapper
     if len(parts) > 1:
-        others = [f"{part.size} ({_in_words(drive, spans(part.mapper.registered))})" for part in parts[1:]]
+        others = [f"{part.size} ({in_words(drive, spans(part.mapper.registered))})" for part in parts[1:]]
         result.append(
             error(
                 "drive-in-components",
@@ -46,7 +46,7 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
         )
     apart = [link for link in parts[0].links if link.by != LinkedBy.IMAGES]
     if apart:
-        linked = [f"{_in_words(drive, spans(link.units))} by {link.by}" for link in apart]
+        linked = [f"{in_words(drive, spans(link.units))} by {link.by}" for link in apart]
         result.append(
             error(
                 "gap-without-images",
@@ -60,7 +60,7 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
         result.append(
             warning(
                 "units-without-pose",
-                f"{int(lost.sum())} of {len(lost)} units have no pose: {_in_words(drive, spans(lost))}",
+                f"{int(lost.sum())} of {len(lost)} units have no pose: {in_words(drive, spans(lost))}",
                 "units_not_registered in report.json has the reason of each. Look at their images (dark, covered, "
                 "without texture, left out?).",
             )
@@ -70,7 +70,7 @@ def findings(parts: Sequence[Component]) -> list[Finding]:
 
 def lost(mapper: Mapper, problem: ReconstructionError) -> Finding:
     """A component that could not be refined."""
-    where = _in_words(mapper.drive, spans(mapper.registered))
+    where = in_words(mapper.drive, spans(mapper.registered))
     return error(
         "component-lost",
         f"a component of {int(mapper.registered.sum())} units ({where}) has no scene: {problem}",
@@ -88,7 +88,8 @@ def spans(units: Bools) -> list[tuple[int, int]]:
     return [(int(rows[a]), int(rows[b])) for a, b in zip(first, last, strict=True)]
 
 
-def _in_words(drive: Drive, runs: Sequence[tuple[int, int]]) -> str:
+def in_words(drive: Drive, runs: Sequence[tuple[int, int]]) -> str:
+    """Frames and times of runs of units, as `spans` gives them."""
     frames = drive.manifest.frames
     start_us = frames[0].timestamp_us
 

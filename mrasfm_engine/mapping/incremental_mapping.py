@@ -27,6 +27,7 @@ from mrasfm_engine.mapping.keyframes import select_keyframes
 from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX
 from mrasfm_engine.mapping.loop_closure import close_loops, find_revisits
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.mapping.places_alike import SoundPairs
 from mrasfm_engine.mapping.pose_adjustment import adjust_poses
 from mrasfm_engine.mapping.road import RoadAssessment, drop_off_road
 from mrasfm_engine.mapping.static_images import find_still_keypoints
@@ -63,6 +64,7 @@ class MappingLog:
     loop_moved_m: float = 0.0  # by how much closing the loops moved a unit at most
     verified_again: bool = False  # whether matches within units were judged anew, by a calibration that had moved
     contradiction: Finding | None = None  # of the calibration as given by how the cameras move
+    alike: SoundPairs | None = None  # of the drive, what became of pairs where places look alike
     covered_images: dict[int, float] = field(default_factory=dict)  # by image, the share of keypoints that move along
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.solver import Report
 from mrasfm_engine.geometry.camera_model import unpack_camera
-from mrasfm_engine.mapping import rig_motion
+from mrasfm_engine.mapping import gaps, rig_motion
 from mrasfm_engine.mapping.calibration import heading_change_deg
 from mrasfm_engine.mapping.incremental_mapping import MappingLog
 from mrasfm_engine.mapping.mapper import Mapper
@@ -74,10 +74,40 @@ def describe(mapper: Mapper, log: MappingLog, others: Sequence[Mapper] = ()) -> 
             "moved_at_most_m": log.loop_moved_m,
         },
         "matches_within_units_verified_again": log.verified_again,
+        "places_alike": _places_alike(log),
         "local_adjustments": log.local_adjustments,
         "global_adjustments": [_adjustment(r) for r in log.global_adjustments],
         "road_points_dropped": [0 if isinstance(j, str) else int((~j.is_inlier).sum()) for j in log.roads],
     }
+
+
+def _places_alike(log: MappingLog) -> dict[str, Any] | None:
+    """Runs of units around which places look alike, and pairs of images that this rests on; None without any."""
+    if log.alike is None or not log.alike.alike.any():
+        return None
+    return {
+        "spans": [list(span) for span in gaps.spans(log.alike.alike)],
+        "pairs_with_known_direction": log.alike.told,
+        "pairs_against_it": log.alike.turned,
+        "pairs_set_aside": len(log.alike.set_aside),
+    }
+
+
+def places_alike_findings(mapper: Mapper, log: MappingLog) -> list[Finding]:
+    """The finding on places that look alike."""
+    if log.alike is None or not log.alike.alike.any():
+        return []
+    where = gaps.in_words(mapper.drive, gaps.spans(log.alike.alike))
+    return [
+        warning(
+            "places-alike",
+            f"places look alike in {where}, as facades do that repeat: of {log.alike.told} pairs of images that others "
+            f"lie between, {log.alike.turned} show the camera moving the other way",
+            "The scene rests on images there that follow one another, and does without "
+            f"{len(log.alike.set_aside)} other pairs. Where frames are half a period apart or more, it may be wrong "
+            "all the same: look at the trajectory in report.html.",
+        )
+    ]
 
 
 def _why_missing(mapper: Mapper, log: MappingLog, unit: int, keypoints: int) -> str:

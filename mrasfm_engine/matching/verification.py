@@ -88,7 +88,7 @@ def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> Bools:
         for _ in range(REFINEMENTS):
             if inliers.sum() < MIN_RANSAC_MATCHES:
                 break
-            refined = _angles(_linear_essential(turned_a[inliers], turned_b[inliers]), turned_a, turned_b) < max_error
+            refined = _angles(linear_essential(turned_a[inliers], turned_b[inliers]), turned_a, turned_b) < max_error
             if refined.sum() <= inliers.sum():
                 break
             inliers = refined
@@ -117,7 +117,7 @@ def _angles(essential: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
     return result
 
 
-def _linear_essential(rays_a: Floats, rays_b: Floats) -> Floats:
+def linear_essential(rays_a: Floats, rays_b: Floats) -> Floats:
     """The essential matrix nearest to what solves all equations b' E a = 0 [Hartley and Zisserman, 11.1]."""
     equations = (rays_b[:, :, None] * rays_a[:, None, :]).reshape(len(rays_a), 9)
     _, vectors = np.linalg.eigh(equations.T @ equations)

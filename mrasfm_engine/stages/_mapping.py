@@ -103,6 +103,7 @@ def described(parts: Sequence[Component]) -> dict[str, Any]:
             for finding in [
                 *([] if parts[0].log.contradiction is None else [parts[0].log.contradiction]),
                 *gaps.findings(parts),
+                *mapping_report.places_alike_findings(parts[0].mapper, parts[0].log),
                 *mapping_report.covered_camera_findings(parts[0].mapper, parts[0].log),
             ]
         ],

@@ -194,6 +194,8 @@ def _rejected(scene: Scene, stages: Sequence[Mapping[str, Any]]) -> str:
     tracks = refinement.get("moving_objects", {}).get("tracks_dropped_because", {})
     adjusted, off_road = refinement.get("rejected", {}), refinement.get("road", {}).get("dropped")
     lines = [f"{number(count)} pairs of images: {text(why)}" for why, count in pairs.items() if count]
+    if mapping.get("places_alike"):
+        lines.append(f"{number(mapping['places_alike']['pairs_set_aside'])} pairs of images: places look alike")
     lines += [
         f"{number(adjusted[what])} {what} in the last adjustment"
         for what in ("observations", "points")
