@@ -7,7 +7,7 @@ import os
 import socket
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -29,6 +29,7 @@ from service.settings import Settings
 from service.storage.artifacts import ArtifactStore
 from service.storage.blob_writer import StoredFile, file_sha256, store_file
 from service.storage.process_folder import process_folder, sweep
+from service.storage.transfers import STORES, at_one_time
 from worker.attempt import AttemptFolder, run_attempt
 from worker.checkpoints import CheckpointKeeper
 from worker.child_protocol import SubmapPlan, Work
@@ -311,21 +312,21 @@ class _Execution:
         return max(first_s, min(delay_s, self._settings.longest_retry_delay_seconds))
 
     def _publish(self, done: Succeeded) -> None:
-        found = sorted(_artifacts(done.out).items())
-        files: dict[str, StoredFile] = {}
+        found = _artifacts(done.out)
+        contents = {name: file_sha256(path) for name, path in found.items()}
         # Each content once: masks are often alike, and an object whose blob is another's is nobody's.
+        unlike = [(sha256, found[name]) for sha256, name in {contents[name]: name for name in sorted(found)}.items()]
         stored: dict[str, StoredFile] = {}
-        for i, (name, path) in enumerate(found):
-            sha256 = file_sha256(path)
-            if sha256 not in stored:
-                stored[sha256] = self._store(path, sha256)
-            files[name] = stored[sha256]
-            self._meter.update(Stage.PUBLISH, i + 1, len(found))
+        with closing(at_one_time(STORES, lambda one: self._store(*one), unlike)) as stores:
+            for place, ended in stores:
+                stored[unlike[place][0]] = ended.result()
+                self._meter.update(Stage.PUBLISH, len(stored), len(unlike))
+        files = {name: stored[contents[name]] for name in sorted(found)}
         self._check_stop()
         made = self._commit(lambda session: self._handler.publish(session, done, files, self._settings))
         log.info("published", extra={"fields": made or {}})
 
-    def _store(self, path: Path, sha256: str) -> StoredFile:
+    def _store(self, sha256: str, path: Path) -> StoredFile:
         store = partial(
             store_file,
             self._database,

@@ -22,11 +22,12 @@ from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.domain.drive_checkout import materialise
-from service.domain.map_inputs import MapInputs, StoredArtifact, inputs_of
+from service.domain.map_inputs import MapInputs, inputs_of
 from service.job_queue import QUEUES
 from service.settings import Settings
 from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
+from service.storage.transfers import fetch_each
 from worker.attempt import AttemptFolder
 from worker.child_protocol import Attempt, SubmapPlan, Work
 from worker.outcomes import Succeeded
@@ -196,9 +197,11 @@ class AggregationHandler:
         """The scenes as folders, and the version that they are added to."""
         inputs, root = self._inputs, folder.root
         into = root / "base" if inputs.base else None
-        wanted = [(root / "scenes" / name / file.path, file) for name, files in inputs.scenes.items() for file in files]
-        wanted += [(root / "base" / file.path, file) for file in inputs.base]
-        _fetch_all(wanted, fetch, lambda done: progress(done, len(wanted)))
+        wanted = [
+            (file.key, root / "scenes" / name / file.path) for name, files in inputs.scenes.items() for file in files
+        ]
+        wanted += [(file.key, root / "base" / file.path) for file in inputs.base]
+        fetch_each(fetch, wanted, progress=progress)
         return Attempt(
             work=Work.AGGREGATION,
             settings=self._held.settings,
@@ -254,8 +257,8 @@ class ExportHandler:
             files, drives = inputs.files(session), inputs.drives(session)
         source = folder.root / "source"
         total = len(files) + len(drives)  # a drive counts as one until its files are known
-        wanted = [(source / file.path, file) for file in files]
-        _fetch_all(wanted, fetch, lambda done: progress(done, total))
+        wanted = [(file.key, source / file.path) for file in files]
+        fetch_each(fetch, wanted, progress=lambda done, _: progress(done, total))
         folders: dict[str, Path] = {}
         for drive_id in sorted(set(drives.values())):
             folders[drive_id] = folder.root / "drives" / drive_id
@@ -281,14 +284,6 @@ class ExportHandler:
             expires_us=_expires_us(settings.export_retention_days),
         )
         return {"export_id": export_id}
-
-
-def _fetch_all(wanted: Sequence[tuple[Path, StoredArtifact]], fetch: Fetch, progress: Callable[[int], None]) -> None:
-    """Bring files to their places; `progress` is called with how many are there."""
-    for done, (target, file) in enumerate(wanted, start=1):
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        fetch(file.key, target)
-        progress(done)
 
 
 JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler | ExportHandler

@@ -18,8 +18,9 @@ from service.database.connections import Database
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
 from service.storage import blobs
-from service.storage.artifacts import Fetch, ObjectMissingError
+from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
+from service.storage.transfers import fetch_each
 
 log = logging.getLogger("mrasfm.worker")
 
@@ -90,17 +91,17 @@ def restore(
     with database.read() as session:
         found = {name: kept for name, kept in _shelved(session, shelf).items() if is_wanted(name)}
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-    brought = []
-    for name, kept in found.items():
-        try:
-            fetch(kept.key, folder / name)
-        except ObjectMissingError:
-            log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
-            with database.write() as session:
-                _forget(session, kept.id)
-        else:
-            brought.append(name)
-    return brought
+    names, lost = list(found), list[str]()
+
+    def forget(place: int) -> None:
+        name = names[place]
+        log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
+        with database.write() as session:
+            _forget(session, found[name].id)
+        lost.append(name)
+
+    fetch_each(fetch, [(found[name].key, folder / name) for name in names], on_missing=forget)
+    return [name for name in names if name not in lost]
 
 
 def _forget(session: Session, blob_id: str) -> None:

@@ -12,6 +12,7 @@ from schemas.file_names import MANIFEST_NAME
 from service.database.connections import Database
 from service.database.tables import Blob, Drive, DriveFile
 from service.storage.artifacts import Fetch
+from service.storage.transfers import fetch_each
 
 
 class DriveGoneError(Exception):
@@ -32,7 +33,7 @@ def materialise(
     Parameters
     ----------
     fetch
-        Brings one file.
+        Brings one file, in any thread.
     progress
         Called as progress(done, total) with each file.
     units
@@ -60,11 +61,8 @@ def materialise(
     fetch(manifest.key, folder / MANIFEST_NAME)
     wanted = None if units is None else _files_of_units(folder / MANIFEST_NAME, units)
     brought = [(path, key) for path, key, _ in files if wanted is None or path in wanted]
-    for i, (path, key) in enumerate(brought):
-        target = folder / path  # checked when the manifest came: relative, without '..'
-        target.parent.mkdir(parents=True, exist_ok=True)
-        fetch(key, target)
-        progress(i + 1, len(brought))
+    # Paths were checked when the manifest came: relative, without '..'.
+    fetch_each(fetch, [(key, folder / path) for path, key in brought], progress=progress)
     return {path: sha256 for path, _, sha256 in files}
 
 

@@ -25,6 +25,7 @@ from obstore.exceptions import BaseError
 from service.settings import Settings
 from service.storage import artifacts
 from service.storage.artifacts import ArtifactStore
+from service.storage.transfers import fetch_each
 from tests.helpers.live_api import HOST, free_port, settings_of, wait_until
 from worker.retry import retry
 
@@ -112,6 +113,15 @@ def test_a_fetched_file_is_the_object_and_cannot_be_written(stored: ArtifactStor
         assert target.stat().st_mode & 0o222 == 0, "a stage cannot change what is stored"
         target.unlink()
     assert stored.read(KEY) == CONTENT
+
+
+def test_many_objects_are_fetched_at_one_time(store: ArtifactStore, tmp_path: Path) -> None:
+    contents = {f"blobs/prj_1/{n:02d}/{n}": os.urandom(10_000 + n) for n in range(40)}
+    for key, content in contents.items():
+        put(store, tmp_path / "scratch", content, key)
+    fetch_each(store.fetch, [(key, tmp_path / "fetched" / Path(key).name) for key in contents])
+    for key, content in contents.items():
+        assert (tmp_path / "fetched" / Path(key).name).read_bytes() == content
 
 
 def test_what_is_not_there(store: ArtifactStore, tmp_path: Path) -> None:
