@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.drive import MAX_GNSS_GAP_S, DriveManifest, Gnss
+from schemas.drive import LAST_TIMESTAMP_US, MAX_GNSS_GAP_S, DriveManifest, Gnss
 from schemas.findings import Finding, error, listed, warning
 
 # Between GPS time and UTC: 18 s since 2017; a neighbouring value betrays an old table of leap seconds.
 LEAP_SECONDS = (18, 17, 19)
+OTHER_UNITS_US = {"nanoseconds": 1e-3, "milliseconds": 1e3, "seconds": 1e6}
 MAX_SPEED_MPS = 100.0
 JUMP_SIGMAS = 4.0
 # Positions this far beyond the first or last sample can be extrapolated: in samples, and at most in time.
@@ -113,6 +114,15 @@ def _covered(images: Ints, samples: Ints) -> Bools:
     return covered
 
 
+def unit_by_cover(images: Ints, times: Ints) -> str:
+    """Name of the unit other than microseconds in which times (n,) cover most images (m,); empty if there is none."""
+    for unit, each_us in OTHER_UNITS_US.items():
+        in_us = times * each_us
+        if in_us[-1] <= LAST_TIMESTAMP_US and _covered(images, np.round(in_us).astype(np.int64)).mean() >= 0.5:
+            return unit
+    return ""
+
+
 def _check_cover(images: Ints, times: Ints) -> list[Finding]:
     covered = _covered(images, times)
     if covered.all():
@@ -138,10 +148,16 @@ def _check_cover(images: Ints, times: Ints) -> list[Finding]:
                         "one.",
                     )
                 ]
-    remedy = "Give samples of the drive's whole time on the clock of the images, or use --no-gnss."
     if covered.mean() < 0.5:
+        unit = unit_by_cover(images, times)
         return [
-            error("gnss-not-covering", f"{span}: {int((~covered).sum())} of {len(images)} images have none", remedy)
+            error(
+                "gnss-not-covering",
+                f"{span}: {int((~covered).sum())} of {len(images)} images have none"
+                f"{unit and f'; timestamp_us of gnss.samples look like {unit}'}",
+                "Give gnss.samples of the drive's whole time with timestamp_us in microseconds on the clock of the "
+                "images, or use --no-gnss.",
+            )
         ]
     what = f"{span}: {int((~covered).sum())} of {len(images)} images are without GNSS"
     return [warning("gnss-partial", what, "Nothing needs to be done; positions there come from the images alone.")]

@@ -10,8 +10,6 @@ import json
 import math
 import resource
 import sys
-from bisect import bisect_left, bisect_right
-from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,14 +29,13 @@ from schemas.drive import (
     RoughTrajectory,
 )
 from schemas.findings import Finding, Severity, as_json, error, listed, warning
-from schemas.gnss_check import JUMP_SIGMAS, MAX_SPEED_MPS, check_gnss
+from schemas.gnss_check import JUMP_SIGMAS, MAX_SPEED_MPS, OTHER_UNITS_US, check_gnss, unit_by_cover
 from schemas.parsing import DocumentError, parse_manifest
+from schemas.synchronisation_check import MAX_UNSYNCHRONISED_US, TimedImage, check_synchronisation
 
-MAX_UNSYNCHRONISED_US = 60_000  # nuScenes' cameras are up to 50 ms apart
 MIN_FRAME_INTERVAL_US = 1_000
 MAX_FRAME_INTERVAL_US = 20_000_000
 USUAL_INTERVAL_US = 100_000
-OTHER_UNITS_US = {"nanoseconds": 1e-3, "milliseconds": 1e3, "seconds": 1e6}
 MAX_CAMERA_ROLL_DEG = 60.0
 MAX_VEHICLE_TILT_DEG = 60.0  # no road is steeper than 20
 LEVEL_DEG = 45.0  # half of what tells one axis from another
@@ -93,17 +90,17 @@ class _Recorded:
         return np.array([frame.timestamp_us for frame in self.manifest.frames], dtype=np.int64)
 
     @property
-    def images(self) -> Iterator[tuple[str, str, int, int]]:
-        """Camera, file, timestamp and the frame's timestamp of every image."""
+    def timed_images(self) -> Iterator[tuple[str, TimedImage]]:
+        """Camera and times of every image."""
         for frame in self.manifest.frames:
             for camera, image in frame.images.items():
-                own = frame.timestamp_us if image.timestamp_us is None else image.timestamp_us
-                yield camera, image.file, own, frame.timestamp_us
+                own_us = frame.timestamp_us if image.timestamp_us is None else image.timestamp_us
+                yield camera, TimedImage(file=image.file, own_us=own_us, frame_us=frame.timestamp_us)
 
     @cached_property
     def used_cameras(self) -> set[str]:
         """Cameras with images."""
-        return {camera for camera, *_ in self.images}
+        return {camera for camera, _ in self.timed_images}
 
     @cached_property
     def baselines(self) -> list[tuple[Camera, Camera, float]]:
@@ -117,7 +114,7 @@ class _Recorded:
     @cached_property
     def image_times_us(self) -> NDArray[np.int64]:
         """Timestamps of all images, or of the frames where there is no image."""
-        times = [own for _, _, own, _ in self.images]
+        times = [image.own_us for _, image in self.timed_images]
         return np.array(times, dtype=np.int64) if times else self.timestamps_us
 
 
@@ -173,7 +170,7 @@ def _check_times(recorded: _Recorded) -> list[Finding]:
                     "Give frames.timestamp_us in microseconds, and the samples of gnss and rough_poses too.",
                 )
             )
-    return [*findings, *_check_synchronisation(recorded)]
+    return [*findings, *check_synchronisation(recorded.timed_images)]
 
 
 def _complaint_of(median: float) -> str:
@@ -182,33 +179,6 @@ def _complaint_of(median: float) -> str:
     unit = min(intervals_us, key=lambda name: abs(math.log(max(intervals_us[name], 1e-9) / USUAL_INTERVAL_US)))
     usual = MIN_FRAME_INTERVAL_US <= intervals_us[unit] <= MAX_FRAME_INTERVAL_US
     return f"look like {unit}" if usual else "are not microseconds"
-
-
-def _check_synchronisation(recorded: _Recorded) -> list[Finding]:
-    """Find images far from their frame's time, and cameras most of whose images belong to other frames."""
-    off: list[tuple[int, str]] = []
-    frames_us, elsewhere = defaultdict[str, list[int]](list), Counter[str]()
-    for camera, _, _, of_frame in recorded.images:
-        frames_us[camera].append(of_frame)
-    for camera, file, own, of_frame in recorded.images:
-        if abs(own - of_frame) <= MAX_UNSYNCHRONISED_US:
-            continue
-        off.append((abs(own - of_frame), file))
-        first, last = sorted((own, of_frame))
-        # Frames without an image of this camera are those of faster ones.
-        elsewhere[camera] += bisect_left(frames_us[camera], last) > bisect_right(frames_us[camera], first)
-    if not off:
-        return []
-    lost = [camera for camera, count in elsewhere.items() if 2 * count > len(frames_us[camera])]
-    most_us, file = max(off)
-    what = (
-        f"{len(off)} images are over {MAX_UNSYNCHRONISED_US // 1000} ms from their frame's time, most {file} with "
-        f"{most_us / 1000:.0f} ms"
-    )
-    if lost:
-        what += f"; between most images of {listed(lost)} and their frames lie other frames with images of theirs"
-    remedy = "Put images into the frame that is nearest in time; times of frames and of images are on one clock."
-    return [(error if lost else warning)("unsynchronised", what, remedy)]
 
 
 def _check_rig(manifest: DriveManifest) -> list[Finding]:
@@ -332,12 +302,14 @@ def _check_rough_poses(recorded: _Recorded) -> list[Finding]:
     units = recorded.timestamps_us
     covered = (units >= times[0] - MAX_UNSYNCHRONISED_US) & (units <= times[-1] + MAX_UNSYNCHRONISED_US)
     if not covered.any():
+        unit = unit_by_cover(units, times)
         return [
             error(
                 "rough-poses-not-covering",
                 f"the rough poses span {times[0] / 1e6:.3f} to {times[-1] / 1e6:.3f} s, the frames "
-                f"{units[0] / 1e6:.3f} to {units[-1] / 1e6:.3f} s",
-                "Give rough poses of the drive's time, or leave them out.",
+                f"{units[0] / 1e6:.3f} to {units[-1] / 1e6:.3f} s{unit and f'; their timestamps look like {unit}'}",
+                "Give rough_poses.poses of the drive's time with timestamp_us in microseconds on the clock of the "
+                "frames, or leave them out.",
             )
         ]
     found = _check_rough_world(recorded.manifest, rough)
