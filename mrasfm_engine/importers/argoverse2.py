@@ -16,7 +16,14 @@ import numpy as np
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.importers.arrow_tables import Columns, read_feather
 from mrasfm_engine.importers.frame_grouping import units_by_time
-from mrasfm_engine.importers.recording import Recording, SourceImage, choose_scene, interpolated_poses, with_truth
+from mrasfm_engine.importers.recording import (
+    Recording,
+    SourceImage,
+    choose_scene,
+    interpolated_poses,
+    notes_of_poses_elsewhere,
+    with_truth,
+)
 from mrasfm_engine.importers.rig_folder import numbered_images, pinhole_camera
 from mrasfm_engine.importers.skipped_images import notes_of_empty_cameras, unread_files
 from mrasfm_engine.types import Floats, Ints
@@ -44,7 +51,7 @@ def recognises(folder: Path) -> bool:
 def _logs(folder: Path) -> dict[str, Path]:
     candidates = [folder, *sorted(path for path in folder.iterdir() if path.is_dir())]
     found = [c for c in candidates if (c / POSES).is_file() and (c / "sensors" / "cameras").is_dir()]
-    return {path.resolve().name: path for path in found}
+    return {path.resolve().name if path == folder else path.name: path for path in found}
 
 
 def read(folder: Path, scene: str | None = None) -> Recording:
@@ -62,7 +69,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
     """
     log = choose_scene(_logs(folder), scene, folder).resolve()
     every = {
-        path.name: numbered_images(path, digits=TIME_DIGITS)
+        path.name: numbered_images(path, digits=TIME_DIGITS, named_by="time in nanoseconds")
         for path in sorted((log / "sensors" / "cameras").iterdir())
         if path.is_dir()
     }
@@ -93,7 +100,7 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         cameras=cameras,
         units=with_truth(units, truth),
         common_world=None if city is None else f"av2-{city}",
-        notes=[*NOTES, *notes_of_empty_cameras(every)],
+        notes=[*NOTES, *notes_of_empty_cameras(every), *notes_of_poses_elsewhere(units, times_us, truth)],
         unread_files={name: unread_files(log / "sensors" / "cameras" / name) for name in every},
     )
 

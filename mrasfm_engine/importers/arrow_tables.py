@@ -13,10 +13,13 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.importers.recording import proper_transform
 from mrasfm_engine.types import Floats
+from schemas.drive import LAST_TIMESTAMP_US, MAX_COORDINATE_M
 
 MAX_BYTES = 20_000_000_000  # images of a segment of Waymo are 1 to 2 GB, and are read row by row
 MAX_INTEGER = 2**62  # with room to round in 64 bits; nanoseconds of the year 2116
+MAX_SECONDS = LAST_TIMESTAMP_US / 1e6
 EXTRA = "av2"
+_TOO_FAR = f"holds a coordinate beyond {MAX_COORDINATE_M:g} m"
 
 
 def arrow(module: str) -> Any:
@@ -76,6 +79,20 @@ class Columns:
             columns.append(column)
         return np.stack(columns, -1)
 
+    def seconds(self, *names: str) -> Floats:
+        """Values (rows, names) of columns of times in seconds since 1970.
+
+        Raises
+        ------
+        InputError
+            If a column is missing or holds something else.
+        """
+        found = self.numbers(*names)
+        for name, column in zip(names, found.T, strict=True):
+            if not ((column >= 0) & (column <= MAX_SECONDS)).all():
+                raise self._defect(name, "holds a time that is no number of seconds from 1970 to the year 9999")
+        return found
+
     def integers(self, name: str) -> list[int]:
         """Values of a column of integers.
 
@@ -121,11 +138,13 @@ class Columns:
         Raises
         ------
         InputError
-            If a quaternion is not of norm 1.
+            If a quaternion is not of norm 1, or a translation beyond all bounds.
         """
         w_first, t = self.numbers(*quaternion), self.numbers(*translation)
         if len(w_first) and abs(np.linalg.norm(w_first, axis=1) - 1.0).max() > 1e-3:
             raise self._defect(", ".join(quaternion), "holds a quaternion that is not of norm 1")
+        if (np.abs(t) > MAX_COORDINATE_M).any():
+            raise self._defect(", ".join(translation), _TOO_FAR)
         return se3.transform(se3.rotation_from_quaternion(w_first[:, [1, 2, 3, 0]]), t)
 
     def matrices(self, name: str) -> Floats:
@@ -134,14 +153,17 @@ class Columns:
         Raises
         ------
         InputError
-            If one is no rigid transform.
+            If one is no rigid transform, or leads beyond all bounds.
         """
         found = []
         for row, value in enumerate(self._values(name)):
             where = f"{self.source}, row {row}: {name}"
             if not isinstance(value, list) or len(value) != 16 or not all(isinstance(v, float | int) for v in value):
                 raise self._defect(name, f"row {row} is not 16 numbers")
-            found.append(proper_transform(np.array(value, dtype=np.float64).reshape(4, 4), what=where))
+            matrix = proper_transform(np.array(value, dtype=np.float64).reshape(4, 4), what=where)
+            if (np.abs(matrix[:3, 3]) > MAX_COORDINATE_M).any():
+                raise self._defect(name, f"row {row} {_TOO_FAR}")
+            found.append(matrix)
         return np.stack(found) if found else np.empty((0, 4, 4))
 
     def _values(self, name: str) -> list[Any]:

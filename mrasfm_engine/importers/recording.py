@@ -174,6 +174,21 @@ def interpolated_poses(times_us: Ints, world_from_any: Floats, at_us: Ints) -> l
     return [pose if there else None for pose, there in zip(poses, known, strict=True)]
 
 
+def notes_of_poses_elsewhere(units: Sequence[SourceUnit], times_us: Ints, poses: Sequence[Floats | None]) -> list[str]:
+    """A note that no unit is within the times (n,), rising, of the recording's poses; none where one is.
+
+    Parameters
+    ----------
+    poses
+        Of the units, interpolated.
+    """
+    if not units or any(pose is not None for pose in poses):
+        return []
+    own = f"{times_us[0] / 1e6:.3f} to {times_us[-1] / 1e6:.3f} s"
+    of_images = f"{units[0].timestamp_us / 1e6:.3f} to {units[-1].timestamp_us / 1e6:.3f} s"
+    return [f"Poses: those of the recording are of {own} and its images of {of_images}, so that there is no truth."]
+
+
 def with_truth(units: Sequence[SourceUnit], poses: Sequence[Floats | None]) -> list[SourceUnit]:
     """The units with true poses (4, 4), where there are any."""
     return [replace(unit, world_from_rig=pose) for unit, pose in zip(units, poses, strict=True)]

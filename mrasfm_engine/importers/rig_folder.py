@@ -239,13 +239,15 @@ def pinhole_camera(name: str, images: dict[int, Path], k: Floats, rig_from_cam: 
     )
 
 
-def numbered_images(folder: Path, *, digits: int = 12) -> dict[int, Path]:
-    """Images of a folder by their frame number.
+def numbered_images(folder: Path, *, digits: int = 12, named_by: str = "frame number") -> dict[int, Path]:
+    """Images of a folder by the number that is their name.
 
     Parameters
     ----------
     digits
         Of the longest number.
+    named_by
+        What the number is.
 
     Raises
     ------
@@ -261,7 +263,9 @@ def numbered_images(folder: Path, *, digits: int = 12) -> dict[int, Path]:
             continue
         if not re.fullmatch(rf"[0-9]{{1,{digits}}}", file.stem):
             raise InputError(
-                f"image {file} is not named by its frame number", remedy="Name images as 000000.png.", code="bad-name"
+                f"image {file} is not named by its {named_by}",
+                remedy="Name images by digits alone, as 000000.png, or take this one out of the folder.",
+                code="bad-name",
             )
         frame = int(file.stem)
         if frame in found:

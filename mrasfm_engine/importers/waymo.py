@@ -10,6 +10,7 @@ span 0 to their width, and the readout takes y of their height. Shutters roll, o
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from mrasfm_engine.importers.recording import (
     SourceUnit,
     choose_scene,
     interpolated_poses,
+    notes_of_poses_elsewhere,
     with_truth,
 )
 from mrasfm_engine.importers.rig_folder import checked_camera
@@ -51,8 +53,9 @@ _TIME, _CAMERA = "key.frame_timestamp_micros", "key.camera_name"
 _IMAGE, _CALIBRATION = "[CameraImageComponent]", "[CameraCalibrationComponent]"
 _CONTENT, _POSE, _POSE_TIME = f"{_IMAGE}.image", f"{_IMAGE}.pose.transform", f"{_IMAGE}.pose_timestamp"
 _VEHICLE_POSE = "[VehiclePoseComponent].world_from_vehicle.transform"
-_SHUTTER = tuple(
-    f"{_IMAGE}.rolling_shutter_params.{name}" for name in ("camera_trigger_time", "camera_readout_done_time", "shutter")
+_SHUTTER = f"{_IMAGE}.rolling_shutter_params.shutter"
+_TRIGGERED = tuple(
+    f"{_IMAGE}.rolling_shutter_params.{name}" for name in ("camera_trigger_time", "camera_readout_done_time")
 )
 _INTRINSICS = tuple(
     f"{_CALIBRATION}.intrinsic.{name}" for name in ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
@@ -88,12 +91,12 @@ def read(folder: Path, scene: str | None = None) -> Recording:
         If the segment is not there, a table is missing or malformed, or pyarrow is not installed.
     """
     file = choose_scene(_segments(folder), scene, folder)
-    images = read_parquet(file, [_TIME, _CAMERA, _POSE, _POSE_TIME, *_SHUTTER])
+    images = read_parquet(file, [_TIME, _CAMERA, _POSE, _POSE_TIME, *_TRIGGERED, _SHUTTER])
     frames_us, cameras = images.integers(_TIME), images.integers(_CAMERA)
-    trigger_s, done_s, shutter_s = images.numbers(*_SHUTTER).T
+    trigger_s, done_s = images.seconds(*_TRIGGERED).T
     times_us = np.round((trigger_s + done_s) * 5e5).astype(np.int64)
-    readouts_us = (done_s - trigger_s - shutter_s) * 1e6
-    if not frames_us or (times_us < 0).any():
+    readouts_us = (done_s - trigger_s - images.numbers(_SHUTTER)[:, 0]) * 1e6
+    if not frames_us:
         raise InputError(f"table {file} has no images", remedy="Download it again.", code="no-images")
     if unknown := sorted({camera for camera in cameras if camera not in CAMERAS}):
         raise InputError(f"table {file}: camera {unknown[0]} is not known", remedy="Download it again.")
@@ -109,14 +112,19 @@ def read(folder: Path, scene: str | None = None) -> Recording:
             code="bad-table",
         )
     units = _units(frames_us, cameras, times_us)
-    truth = _truth(folder / POSES / file.name, images, np.array([unit.timestamp_us for unit in units]))
+    _require_order(units, sorted(set(frames_us)), file)
+    poses_us, world_from_rig = _poses(folder / POSES / file.name, images)
+    truth = interpolated_poses(poses_us, world_from_rig, np.array([unit.timestamp_us for unit in units]))
     is_unknown = any(camera.readout_us is None for camera in rig)
     return Recording(
         layout="Waymo, version 2",
         name=f"waymo-{file.stem}",
         cameras=rig,
         units=with_truth(units, truth),
-        notes=["Shutter: the readout direction of a camera is not known."] if is_unknown else [],
+        notes=[
+            *(["Shutter: the readout direction of a camera is not known."] if is_unknown else []),
+            *notes_of_poses_elsewhere(units, poses_us, truth),
+        ],
         contents=lambda wanted: _contents(file, wanted, {camera.name: (camera.width, camera.height) for camera in rig}),
     )
 
@@ -177,16 +185,28 @@ def _units(frames_us: list[int], cameras: list[int], times_us: Ints) -> list[Sou
     ]
 
 
-def _truth(file: Path, images: Columns, at_us: Ints) -> list[Floats | None]:
-    """Poses between those of the images and, where the table is there, of the frames."""
-    times_us = np.round(images.numbers(_POSE_TIME)[:, 0] * 1e6).astype(np.int64)
+def _require_order(units: list[SourceUnit], frames_us: list[int], file: Path) -> None:
+    """Refuse frames whose images were not taken after those of the frame before."""
+    for number, (before, after) in enumerate(pairwise(units), start=1):
+        if after.timestamp_us <= before.timestamp_us:
+            raise InputError(
+                f"table {file}: by {' and '.join(_TRIGGERED)}, images of {_TIME} {frames_us[number]} were not taken "
+                f"after those of {frames_us[number - 1]}",
+                remedy="Download it again.",
+                code="bad-table",
+            )
+
+
+def _poses(file: Path, images: Columns) -> tuple[Ints, Floats]:
+    """Times (n,), rising, and poses (n, 4, 4) of the images and, where the table is there, of the frames."""
+    times_us = np.round(images.seconds(_POSE_TIME)[:, 0] * 1e6).astype(np.int64)
     poses = images.matrices(_POSE)
     if file.is_file():
         table = read_parquet(file, [_TIME, _VEHICLE_POSE])
         times_us = np.concatenate([times_us, np.array(table.integers(_TIME), dtype=np.int64)])
         poses = np.concatenate([poses, table.matrices(_VEHICLE_POSE)])
     times_us, first = np.unique(times_us, return_index=True)
-    return interpolated_poses(times_us, poses[first], at_us)
+    return times_us, poses[first]
 
 
 def _contents(

@@ -132,6 +132,31 @@ def test_one_of_several_logs(log: Path, tmp_path: Path) -> None:
     assert import_recording(log.parent, tmp_path / "drive", scene=LOG).images == 2 * FRAMES
 
 
+def test_logs_of_one_name_behind_links_are_several(log: Path, tmp_path: Path) -> None:
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    for name in ("first", "second"):
+        shutil.copytree(log, tmp_path / name / LOG)
+        (logs / name).symlink_to(tmp_path / name / LOG)
+    with pytest.raises(InputError, match="2 scenes: first, second"):
+        import_recording(logs, tmp_path / "drive")
+    assert import_recording(logs, tmp_path / "drive", scene="second").images == 2 * FRAMES
+
+
+def test_poses_of_another_time_are_noted(log: Path, tmp_path: Path) -> None:
+    changed(log / "city_SE3_egovehicle.feather", timestamp_ns=list(range(5 * FRAMES + 1)))
+    summary = import_recording(log, tmp_path / "drive")
+    assert not summary.truth
+    assert any("are of 0.000 to 0.000 s and its images of 315966265.261" in note for note in summary.notes)
+
+
+def test_an_image_that_is_not_named_by_its_time(log: Path, tmp_path: Path) -> None:
+    first = min((log / "sensors" / "cameras" / "ring_side_left").iterdir())
+    first.rename(first.with_name("first.jpg"))
+    with pytest.raises(InputError, match=r"first\.jpg is not named by its time in nanoseconds"):
+        import_recording(log, tmp_path / "drive")
+
+
 def changed(file: Path, **columns: object) -> None:
     rows = {name: column.to_pylist() for name, column in zip(*_columns(file), strict=True)}
     rows.update(columns)
@@ -154,6 +179,12 @@ def _columns(file: Path) -> tuple[list[str], list[Any]]:
         ("calibration/egovehicle_SE3_sensor.feather", {"qw": [3.0, 1.0]}, "holds a quaternion that is not of norm 1"),
         ("calibration/egovehicle_SE3_sensor.feather", {"sensor_name": [1, 2]}, "holds a value that is no text"),
         ("city_SE3_egovehicle.feather", {"timestamp_ns": None}, "column timestamp_ns: is not there"),
+        (
+            "calibration/egovehicle_SE3_sensor.feather",
+            {"ty_m": [1e12, 0]},
+            "sensor.feather, column tx_m, ty_m, tz_m: .* a",
+        ),
+        ("city_SE3_egovehicle.feather", {"tx_m": np.full(5 * FRAMES + 1, 1e300)}, r"beyond 1e\+08 m"),
         (
             "city_SE3_egovehicle.feather",
             {"timestamp_ns": np.full(5 * FRAMES + 1, 2**63, np.uint64)},

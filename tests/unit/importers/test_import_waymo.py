@@ -139,6 +139,20 @@ def changed(folder: Path, kind: str, **columns: Any) -> None:
     [
         ("camera_image", "shutter", None, r"rolling_shutter_params\.shutter: is not there"),
         ("camera_image", "camera_readout_done_time", lambda v: [v[0] + 0.01, *v[1:]], "camera front: images are read"),
+        (
+            "camera_image",
+            "camera_trigger_time",
+            lambda v: [1e6 * t for t in v],
+            "trigger_time: holds a time that is no",
+        ),
+        ("camera_image", "pose_timestamp", lambda v: [1e300, *v[1:]], "pose_timestamp: holds a time that is no"),
+        ("camera_image", "frame_timestamp_micros", lambda v: v[::-1], "micros 1553629304862000 were not taken after"),
+        (
+            "camera_image",
+            "pose.transform",
+            lambda v: [[*v[0][:3], 1e200, *v[0][4:]], *v[1:]],
+            r"pose\.transform: row 0 holds a coordinate beyond 1e\+08 m",
+        ),
         ("camera_image", "camera_name", lambda v: [9, *v[1:]], "camera 9 is not known"),
         ("camera_image", "frame_timestamp_micros", lambda v: v[:1] * len(v), "several images of one camera at one"),
         (
