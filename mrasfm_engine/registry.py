@@ -161,4 +161,11 @@ def _load(
             remedy=f"`mrasfm models list` shows which model is for what; {setting} may be left out.",
             code="bad-settings",
         )
-    return LoadedModel(installed, Network(wanted, data, gpu=gpu))
+    network = Network(wanted, data, gpu=gpu)
+    if problems := installed.known.signature.mismatches(network.signature):  # an earlier version took it in
+        raise InputError(
+            f'{setting} = "{wanted}" does not have the signature of {installed.known.name}: {"; ".join(problems)}',
+            remedy="Export it with these inputs and outputs, and add it again with mrasfm models add.",
+            code="bad-model",
+        )
+    return LoadedModel(installed, network)

@@ -105,7 +105,8 @@ class NetworkExtractor:
             found = self._detector.detect(pixels, wanted, self._config.min_score)
             self._check(found)
             xy = found.xy_px + np.array([tile.column, tile.row], np.float32)
-            keep = tile.owns(xy) & usable(xy)
+            keep = tile.owns(xy)
+            keep[keep] = usable(xy[keep])
             if self._config.min_score is not None:
                 keep &= found.scores >= self._config.min_score
             cut_off = self._detector.takes_number and len(xy) >= wanted
@@ -116,15 +117,24 @@ class NetworkExtractor:
 
     def _check(self, found: Detections) -> None:
         count = len(found.xy_px)
-        shapes = [list(array.shape) for array in (found.xy_px, found.descriptors, found.scores)]
+        arrays = (found.xy_px, found.descriptors, found.scores)
+        shapes = [list(array.shape) for array in arrays]
         fits = found.descriptors.ndim == 2 and [shapes[0], shapes[1][:1], shapes[2]] == [[count, 2], [count], [count]]
-        if not fits or not np.isfinite(found.xy_px).all():
+        name = self._detector.network.name
+        if not fits:
             raise InputError(
-                f"model {self._detector.network.name} gives keypoints {shapes[0]}, descriptors {shapes[1]} and scores "
-                f"{shapes[2]}, or places that are no numbers",
+                f"model {name} gives keypoints {shapes[0]}, descriptors {shapes[1]} and scores {shapes[2]}",
                 remedy="Export it with one descriptor and one score a keypoint.",
                 code="bad-model",
             )
+        for what, values in zip(("keypoints", "descriptors", "scores"), arrays, strict=True):
+            if not np.isfinite(values).all():
+                raise InputError(
+                    f"model {name} gives {what} that are not finite numbers",
+                    remedy="Export it in 32 bit floats: in 16 bits, values over 65504 are infinite. Damaged weights do "
+                    "this as well.",
+                    code="bad-model",
+                )
 
 
 def _up(size: int) -> int:

@@ -21,6 +21,7 @@ GPU_PROVIDERS = (CUDA_PROVIDER, "ROCMExecutionProvider")
 CPU_PROVIDER = "CPUExecutionProvider"
 STRIDE_PX = 32  # sides of an image for a network of free size are multiples of it
 _ELEMENT_TYPES = {"float": "float32", "double": "float64", "float16": "float16"}
+MAX_ERROR_CHARACTERS = 600  # of an error of onnxruntime: its own words begin after a name of a function in C++
 _QUIET = 4  # onnxruntime writes nothing: its errors become our own
 
 
@@ -70,7 +71,7 @@ class Network:
                 self._session = onnxruntime.InferenceSession(data, options, providers=providers)
         except Exception as error:  # onnxruntime raises a dozen kinds without a common root
             raise InputError(
-                f"model {name} cannot be run by onnxruntime {onnxruntime.__version__}: {_first_line(error)}",
+                f"model {name} cannot be run by onnxruntime {onnxruntime.__version__}: {_in_one_line(error)}",
                 remedy="Export it with operators and an opset that this onnxruntime has, or install a newer one.",
                 code="bad-model",
             ) from error
@@ -96,8 +97,9 @@ class Network:
         except Exception as error:
             shapes = ", ".join(f"{name} {list(np.shape(value))}" for name, value in inputs.items())
             raise ReconstructionError(
-                f"model {self.name} failed on {shapes}: {_first_line(error)}",
-                remedy="Lower features.max_side_px or matching.max_keypoints, or use another model.",
+                f"model {self.name} failed on {shapes}: {_in_one_line(error)}",
+                remedy="Export it for inputs of these sizes, or use another model. Where it lacks memory, lower "
+                "features.max_side_px, matching.max_keypoints or threads.",
                 code="model-failed",
             ) from error
         return dict(zip(self._outputs, found, strict=True))
@@ -115,6 +117,7 @@ def _tensor(node: Any) -> Tensor:
     return Tensor(node.name, (_ELEMENT_TYPES.get(kind, kind),), shape)
 
 
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+def _in_one_line(error: Exception) -> str:
+    """Words of an error, which stand on several lines and are as long as a model's author likes."""
+    words = " ".join(str(error).split()) or type(error).__name__
+    return words if len(words) <= MAX_ERROR_CHARACTERS else words[:MAX_ERROR_CHARACTERS] + "..."

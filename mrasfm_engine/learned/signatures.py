@@ -1,6 +1,7 @@
 """Inputs and outputs of models: the contract that a file must keep before it is used.
 
-Shapes have a name where the size is free (the same name means nothing more) and a number where it is fixed.
+Shapes have a name where the size is free (the same name means nothing more) and a number where it is fixed. `H` and `W`
+are the sides of an image: both are fixed or both free, as an image is either resized or filled up.
 """
 
 from __future__ import annotations
@@ -8,6 +9,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+
+from schemas.drive import MAX_IMAGE_SIDE_PX
+
+SIDES = ("H", "W")
+_IMAGE_SIZES = f"both free, or both fixed to 1 to {MAX_IMAGE_SIDE_PX} pixels"
 
 
 class ModelKind(StrEnum):
@@ -43,7 +49,8 @@ class Signature:
     def mismatches(self, found: Signature) -> list[str]:
         """List the differences of `found`, a file's signature; empty where it fits.
 
-        A free size of the file fits any, and a fixed one fits a free size: networks are exported for one image size.
+        A free size of the file fits any, and a fixed one fits a free size: networks are exported for one image size,
+        which is that of an image.
         """
         return [
             *_mismatches("input", self.inputs, found.inputs, complete=True),
@@ -60,6 +67,8 @@ def _mismatches(what: str, expected: Sequence[Tensor], found: Sequence[Tensor], 
             problems.append(f"{what} {tensor} is missing")
         elif not _fits(tensor, other):
             problems.append(f"{what} {tensor} is expected, {other} is there")
+        elif complete and not _has_image_size(tensor, other):
+            problems.append(f"{what} {other} is for no image, whose sides are {_IMAGE_SIZES}")
     # Outputs that nobody asked for cost nothing; an input that nobody feeds fails.
     if complete:
         problems += [f"{what} {tensor} is not expected" for tensor in there.values()]
@@ -75,6 +84,14 @@ def _fits(expected: Tensor, found: Tensor) -> bool:
     return all(
         isinstance(a, str) or isinstance(b, str) or a == b for a, b in zip(expected.shape, found.shape, strict=True)
     )
+
+
+def _has_image_size(expected: Tensor, found: Tensor) -> bool:
+    """Return whether the sides of an image are free, or fixed to a size that images have; of no image they are none."""
+    sides = [size for name, size in zip(expected.shape, found.shape, strict=False) if name in SIDES]
+    are_fixed = [isinstance(size, int) for size in sides]
+    bounded = all(1 <= size <= MAX_IMAGE_SIDE_PX for size in sides if isinstance(size, int))
+    return bounded and len(set(are_fixed)) <= 1
 
 
 FLOAT32, INT64, UINT8 = "float32", "int64", "uint8"

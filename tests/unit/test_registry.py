@@ -10,6 +10,7 @@ from mrasfm_engine.features.network_extractor import NetworkExtractor
 from mrasfm_engine.features.sift import SiftExtractor
 from mrasfm_engine.learned.model_folder import ModelFolder
 from mrasfm_engine.learned.onnx_file import sha256_of
+from mrasfm_engine.learned.signatures import Signature
 from mrasfm_engine.matching.lighterglue import LighterGlueMatcher
 from mrasfm_engine.matching.lightglue import ColmapLightGlueMatcher, LightGlueMatcher
 from mrasfm_engine.matching.nearest_neighbour import NearestNeighbourMatcher
@@ -129,6 +130,19 @@ def test_a_missing_model_is_refused_with_how_to_get_it(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="model aliked-n16rot is not in") as error:
         load(tmp_path, features={"extractor": "aliked"})
     assert "mrasfm models pull aliked-n16rot" in error.value.remedy
+
+
+def test_a_model_that_an_earlier_version_took_in_is_checked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "given.onnx").write_bytes(learned_graphs.segmenter(0, 0))
+    with monkeypatch.context() as earlier:
+        earlier.setattr(Signature, "mismatches", lambda self, found: [])
+        ModelFolder(tmp_path / "models").add(tmp_path / "given.onnx", "segmenter")
+    with pytest.raises(
+        InputError, match=r'semantics\.model = "segmenter" does not have the signature .*is for no image'
+    ):
+        load(tmp_path / "models", semantics={"model": "segmenter"})
 
 
 def test_a_segmenter_is_loaded(folder: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.config import FeatureConfig
+from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.aliked import AlikedDetector
 from mrasfm_engine.features.network_extractor import Detector, NetworkExtractor
 from mrasfm_engine.features.superpoint import SuperPointDetector
@@ -138,6 +139,42 @@ def test_an_empty_image_has_no_keypoints(make: MakeDetector) -> None:
     assert found.descriptors.shape[0] == 0
     assert found.descriptors.shape[1] in (64, 128, 256)
     assert found.colors.shape == (0, 3)
+
+
+def with_values(*, keypoint: float = 5.0, descriptor: float = 0.1, score: float = 0.9) -> bytes:
+    """SuperPoint that gives 5 keypoints in a row, of which one is as said."""
+    graph = learned_graphs.Graph()
+    nothing = graph("Mul", graph("ReduceMean", "image", axes=[0, 1, 2, 3], keepdims=0), graph.constant(0.0))
+
+    def output(shape: tuple[int, ...], usual: float, last: float) -> tuple[str, int, learned_graphs.Shape]:
+        values = np.full(shape, usual)
+        values[0, -1] = last
+        return graph("Add", graph.constant(values), nothing), learned_graphs.F32, shape
+
+    return graph.model(
+        {"image": (learned_graphs.F32, (1, 1, "H", "W"))},
+        {
+            "keypoints": output((1, 5, 2), 5.0, keypoint),
+            "scores": output((1, 5), 0.9, score),
+            "descriptors": output((1, 5, 256), 0.1, descriptor),
+        },
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("what", ["keypoint", "descriptor", "score"])
+def test_outputs_that_are_no_numbers_are_refused_by_name(what: str, value: float) -> None:
+    network = Network("own", with_values(**{what: value}), gpu=False)
+    with pytest.raises(InputError, match=f"model own gives {what}s that are not finite numbers"):
+        extractor(lambda: SuperPointDetector(network)).extract(np.zeros((40, 60, 3), np.uint8), None)
+
+
+@pytest.mark.filterwarnings("error")
+def test_keypoints_far_outside_the_image_are_left_out() -> None:
+    network = Network("own", with_values(keypoint=1e30), gpu=False)
+    mask = np.ones((40, 60), np.bool_)
+    found = extractor(lambda: SuperPointDetector(network)).extract(np.zeros((40, 60, 3), np.uint8), mask)
+    assert len(found.xy_px) == 4
 
 
 def test_the_shrinkage_inside_of_xfeat_is_taken_back() -> None:

@@ -73,6 +73,21 @@ def test_every_signature_fits_its_own_graph_and_no_other(graph: object, signatur
     assert [s for s in known if not s.mismatches(found)] == [signature]
 
 
+@pytest.mark.parametrize("sides", [(0, 0), (0, 96), (20_001, 64), (64, "W"), ("H", 96)])
+def test_an_image_of_no_size_or_of_half_a_size_is_a_mismatch(sides: tuple[int | str, int | str]) -> None:
+    found = Network("s", learned_graphs.segmenter(*sides), gpu=False).signature
+    (problem,) = segmentation.SIGNATURE.mismatches(found)
+    assert problem.startswith(f"input image float32[1,3,{sides[0]},{sides[1]}] is for no image")
+    assert "1 to 20000 pixels" in problem
+
+
+def test_all_lines_of_a_failure_are_told() -> None:
+    network = Network("s", learned_graphs.segmenter(32, 64), gpu=False)
+    with pytest.raises(ReconstructionError, match=r"failed on image \[1, 3, 8, 8\]: .* Got: 8 Expected: 32") as caught:
+        network.run({"image": np.zeros((1, 3, 8, 8), np.float32)})
+    assert "Export it for inputs of these sizes" in caught.value.remedy
+
+
 def test_mismatches_say_what_is_expected_and_what_is_there() -> None:
     found = Network("x", learned_graphs.xfeat(), gpu=False).signature
     problems = superpoint.SIGNATURE.mismatches(found)
