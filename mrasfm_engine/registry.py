@@ -25,6 +25,7 @@ from mrasfm_engine.learned.catalogue import LearnedMethod, Method, default_model
 from mrasfm_engine.learned.model_folder import InstalledModel, ModelFolder, default_folder
 from mrasfm_engine.learned.network import Network
 from mrasfm_engine.matching.prepared_images import Matcher
+from mrasfm_engine.types import Cancel
 from schemas import LabelMap
 from schemas.methods import EXTRACTORS, MATCHERS
 
@@ -65,13 +66,15 @@ class Components:
         return {use: model.describe() for use, model in self.models.items()}
 
 
-def load_components(config: EngineConfig, label_map: LabelMap | None) -> Components:
+def load_components(config: EngineConfig, label_map: LabelMap | None, cancel: Cancel = lambda: False) -> Components:
     """Build what the configuration asks for.
 
     Parameters
     ----------
     label_map
         The drive's: which ids a segmenter may give.
+    cancel
+        Ends calls of models; called in a thread of its own.
 
     Raises
     ------
@@ -79,7 +82,7 @@ def load_components(config: EngineConfig, label_map: LabelMap | None) -> Compone
         Where extractor and matcher do not go together, or a model is missing, damaged, or not what the settings say.
     """
     require_compatible(config.features, config.matching)
-    load = partial(_load, ModelFolder(config.models.folder or default_folder()), gpu=config.models.gpu)
+    load = partial(_load, ModelFolder(config.models.folder or default_folder()), gpu=config.models.gpu, cancel=cancel)
     models: dict[str, LoadedModel] = {}
     descriptors = config.features.extractor
     extracting = extractor_method(descriptors)
@@ -149,7 +152,14 @@ def _needs_model(method: object) -> bool:
 
 
 def _load(
-    folder: ModelFolder, setting: str, name: str | None, method: str, descriptors: str | None, *, gpu: bool
+    folder: ModelFolder,
+    setting: str,
+    name: str | None,
+    method: str,
+    descriptors: str | None,
+    *,
+    gpu: bool,
+    cancel: Cancel,
 ) -> LoadedModel:
     usual = default_model(method, descriptors) if descriptors is not None else None
     wanted = name or (usual.name if usual is not None else method)
@@ -161,7 +171,7 @@ def _load(
             remedy=f"`mrasfm models list` shows which model is for what; {setting} may be left out.",
             code="bad-settings",
         )
-    network = Network(wanted, data, gpu=gpu)
+    network = Network(wanted, data, gpu=gpu, cancel=cancel)
     if problems := installed.known.signature.mismatches(network.signature):  # an earlier version took it in
         raise InputError(
             f'{setting} = "{wanted}" does not have the signature of {installed.known.name}: {"; ".join(problems)}',

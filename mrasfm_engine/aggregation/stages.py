@@ -56,7 +56,7 @@ class Run:
     @cached_property
     def components(self) -> Components:
         """The matcher; its model is loaded at the first use, once."""
-        return load_components(self.config, None)
+        return load_components(self.config, None, self.cancel)
 
     @cached_property
     def extended(self) -> dict[str, Any] | None:

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.errors import InputError, ReconstructionError
+from mrasfm_engine.errors import CancelledError, InputError, ReconstructionError
 from mrasfm_engine.learned.signatures import Signature, Tensor
+from mrasfm_engine.learned.stoppable_calls import StoppableCalls
+from mrasfm_engine.types import Cancel
 
 Array = NDArray[Any]
 
@@ -42,6 +44,8 @@ class Network:
         Use a GPU where this onnxruntime has a provider that starts; else the CPU.
     keeps_memory
         Keep a call's memory for the next one; without, a network of one operator is a megabyte smaller.
+    cancel
+        Ends calls when the work is no longer wanted; called in a thread of its own.
 
     Raises
     ------
@@ -49,7 +53,9 @@ class Network:
         Where this runtime cannot load the model, as when it lacks an operator.
     """
 
-    def __init__(self, name: str, data: bytes, *, gpu: bool, keeps_memory: bool = True) -> None:
+    def __init__(
+        self, name: str, data: bytes, *, gpu: bool, keeps_memory: bool = True, cancel: Cancel = lambda: False
+    ) -> None:
         # Loads in half a second; who uses no model does not wait for it.
         import onnxruntime
 
@@ -81,20 +87,28 @@ class Network:
             outputs=tuple(_tensor(node) for node in self._session.get_outputs()),
         )
         self._outputs = [tensor.name for tensor in self.signature.outputs]
+        self._cancel, self._calls, self._call_options = cancel, StoppableCalls(cancel), onnxruntime.RunOptions
 
     def run(self, inputs: Mapping[str, Array]) -> dict[str, Array]:
         """Outputs by name.
 
         Raises
         ------
+        CancelledError
+            Where the work is no longer wanted.
         ReconstructionError
             Where the runtime fails.
         """
+        options = self._call_options()
+        options.log_severity_level = _QUIET
         try:
-            found = self._session.run(self._outputs, dict(inputs))
+            with self._calls.one(options):
+                found = self._session.run(self._outputs, dict(inputs), options)
         except MemoryError:
             raise
         except Exception as error:
+            if self._cancel():
+                raise CancelledError from error
             shapes = ", ".join(f"{name} {list(np.shape(value))}" for name, value in inputs.items())
             raise ReconstructionError(
                 f"model {self.name} failed on {shapes}: {_in_one_line(error)}",

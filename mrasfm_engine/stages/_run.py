@@ -68,7 +68,7 @@ class Run:
     @cached_property
     def components(self) -> Components:
         """Extractor, matcher and segmenter; their models are loaded at the first use, once."""
-        return load_components(self.config, self.drive.manifest.label_map)
+        return load_components(self.config, self.drive.manifest.label_map, self.cancel)
 
     @property
     def extractor(self) -> Extractor:

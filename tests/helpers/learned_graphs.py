@@ -200,6 +200,28 @@ def segmenter(rows: int | str = "H", columns: int | str = "W", *, dark: int = 2,
     return g.model({"image": (F32, (1, 3, rows, columns))}, {"classes": (classes, U8, (1, rows, columns))})
 
 
+def endless_segmenter() -> bytes:
+    """A segmenter that counts to 2^62 first."""
+    g = Graph()
+    body = helper.make_graph(
+        [
+            helper.make_node("Identity", ["go_on"], ["goes_on"]),
+            helper.make_node("Add", ["before", "before"], ["after"]),
+        ],
+        "body",
+        [
+            helper.make_tensor_value_info("count", I64, []),
+            helper.make_tensor_value_info("go_on", BOOL, []),
+            helper.make_tensor_value_info("before", F32, []),
+        ],
+        [helper.make_tensor_value_info("goes_on", BOOL, []), helper.make_tensor_value_info("after", F32, [])],
+    )
+    mean = g("ReduceMean", "image", axes=[0, 1, 2, 3], keepdims=0)
+    last = g("Loop", g.constant(2**62, np.int64), g.constant(True, np.bool_), mean, body=body)
+    classes = g("Cast", g("Mul", g("ReduceMean", "image", axes=[1], keepdims=0), last), to=U8)
+    return g.model({"image": (F32, (1, 3, "H", "W"))}, {"classes": (classes, U8, (1, "H", "W"))})
+
+
 def with_external_data(data: bytes) -> bytes:
     """The same model with its first constant in another file."""
     model = onnx.load_from_string(data)

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import onnxruntime
 import pytest
 
-from mrasfm_engine.errors import InputError, ReconstructionError
+from mrasfm_engine.errors import CancelledError, InputError, ReconstructionError
 from mrasfm_engine.features import aliked, segmentation, superpoint, xfeat
 from mrasfm_engine.learned.catalogue import known_models
 from mrasfm_engine.learned.network import CPU_PROVIDER, GPU_PROVIDERS, Network
 from mrasfm_engine.learned.signatures import Signature
+from mrasfm_engine.learned.stoppable_calls import POLL_S
 from mrasfm_engine.matching import lighterglue, lightglue, superglue
 from tests.helpers import learned_graphs
 
@@ -79,6 +82,30 @@ def test_an_image_of_no_size_or_of_half_a_size_is_a_mismatch(sides: tuple[int | 
     (problem,) = segmentation.SIGNATURE.mismatches(found)
     assert problem.startswith(f"input image float32[1,3,{sides[0]},{sides[1]}] is for no image")
     assert "1 to 20000 pixels" in problem
+
+
+def test_calls_under_way_end_when_the_work_is_no_longer_wanted() -> None:
+    cancel = threading.Event()
+    network = Network("endless", learned_graphs.endless_segmenter(), gpu=False, cancel=cancel.is_set)
+    image = np.full((1, 3, 32, 32), 0.5, np.float32)
+    with ThreadPoolExecutor(2) as pool:
+        calls = [pool.submit(network.run, {"image": image}) for _ in range(2)]
+        time.sleep(2 * POLL_S)
+        assert not any(call.done() for call in calls)
+        cancel.set()
+        for call in calls:
+            with pytest.raises(CancelledError):
+                call.result(timeout=30)
+
+
+def test_calls_are_watched_again_after_a_pause() -> None:
+    cancel = threading.Event()
+    network = Network("s", learned_graphs.segmenter(), gpu=False, cancel=cancel.is_set)
+    image = np.full((1, 3, 32, 32), 0.9, np.float32)
+    for _ in range(3):
+        assert (network.run({"image": image})["classes"] == 13).all()
+        time.sleep(2 * POLL_S)
+    assert "stoppable-calls" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_all_lines_of_a_failure_are_told() -> None:
