@@ -36,6 +36,7 @@ from schemas.synchronisation_check import MAX_UNSYNCHRONISED_US, TimedImage, che
 MIN_FRAME_INTERVAL_US = 1_000
 MAX_FRAME_INTERVAL_US = 20_000_000
 USUAL_INTERVAL_US = 100_000
+PAUSE_INTERVALS = 1.5  # of the usual ones: a frame or more is missing in between
 MAX_CAMERA_ROLL_DEG = 60.0
 MAX_VEHICLE_TILT_DEG = 60.0  # no road is steeper than 20
 LEVEL_DEG = 45.0  # half of what tells one axis from another
@@ -146,8 +147,10 @@ def _check_common_frames(recorded: _Recorded) -> list[Finding]:
     """Find cameras whose frames have images of no other: only the motion between frames relates them to the rig."""
     together = {camera for frame in recorded.manifest.frames if len(frame.images) > 1 for camera in frame.images}
     alone = [c.name for c in recorded.manifest.rig.cameras if c.name in recorded.used_cameras - together]
-    if not alone or len(recorded.used_cameras) < 2:
+    if len(recorded.used_cameras) < 2:
         return []
+    if not alone:
+        return _check_clocks(recorded)
     return [
         warning(
             "camera-alone",
@@ -156,6 +159,36 @@ def _check_common_frames(recorded: _Recorded) -> list[Finding]:
             "clock?",
         )
     ]
+
+
+def _check_clocks(recorded: _Recorded) -> list[Finding]:
+    """Find a camera that is alone before or after the drive's longest pause: its clock leaps there, or begins anew.
+
+    Of one that merely begins earlier or ends later than the others, no pause parts these images from the rest.
+    """
+    frames = recorded.manifest.frames
+    if len(frames) < 3:
+        return []
+    intervals_us = np.diff(recorded.timestamps_us)
+    last = int(np.argmax(intervals_us))
+    if intervals_us[last] < PAUSE_INTERVALS * np.median(intervals_us):
+        return []
+    for part, where in (
+        (frames[: last + 1], f"up to frames.{last}"),
+        (frames[last + 1 :], f"from frames.{last + 1} on"),
+    ):
+        alone = {camera for frame in part for camera in frame.images}
+        if len(alone) == 1 and len(part) > 1:
+            return [
+                warning(
+                    "camera-alone",
+                    f"{where} there are images of {alone.pop()} alone, and between frames.{last} and frames.{last + 1} "
+                    f"is the longest pause, {intervals_us[last] / 1e6:.1f} s",
+                    "Where the camera's clock leaps there or begins anew, correct timestamp_us, and put images that "
+                    "were taken together into one frame. Where the other cameras were off, nothing needs to be done.",
+                )
+            ]
+    return []
 
 
 def _check_times(recorded: _Recorded) -> list[Finding]:

@@ -95,6 +95,36 @@ def test_a_camera_takes_one_image_after_the_other(document: Document) -> None:
     assert "before that of images/left/000000.png" in found(document, use_gnss=False)["image-times-order"].what
 
 
+def apart(document: Document, moved_us: int, *, before: bool = False) -> Document:
+    """Put the left images of the last four frames into frames of their own, at another time."""
+    frames = document["frames"]
+    own = [
+        {"timestamp_us": f["timestamp_us"] + moved_us, "images": {"left": f["images"].pop("left")}} for f in frames[8:]
+    ]
+    for number, frame in enumerate(own):
+        frame["source_frame"] = FRAMES + number
+    document["frames"] = [*own, *frames] if before else [*frames, *own]
+    return document
+
+
+def test_images_that_a_clock_puts_elsewhere_are_named(document: Document) -> None:
+    finding = found(apart(document, 5_000_000), use_gnss=False)["camera-alone"]
+    assert finding.what.startswith("from frames.12 on there are images of left alone")
+    assert "between frames.11 and frames.12 is the longest pause, 4.7 s" in finding.what
+
+
+def test_images_of_a_clock_that_begins_anew_are_named(document: Document) -> None:
+    finding = found(apart(document, -START_US, before=True), use_gnss=False)["camera-alone"]
+    assert finding.what.startswith("up to frames.3 there are images of left alone")
+
+
+def test_a_camera_that_ends_later_than_others_is_none(document: Document) -> None:
+    for frame in document["frames"][6:]:
+        del frame["images"]["right"]
+        frame["timestamp_us"] += 20_000  # the longest interval of all, and no pause
+    assert found(document) == {}
+
+
 @pytest.mark.parametrize(("per_us", "unit"), [(1_000, "milliseconds"), (100_000, "")])
 def test_gnss_times_in_another_unit(document: Document, per_us: int, unit: str) -> None:
     for sample in document["gnss"]["samples"]:
