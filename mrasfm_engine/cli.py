@@ -21,6 +21,7 @@ from pathlib import Path
 from mrasfm_engine.errors import CancelledError, MrasfmError, TerminatedError
 from mrasfm_engine.freed_memory import loading
 
+EXIT_OUT_OF_MEMORY = 1  # as of any program that fails
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 EXIT_UNREAD = 141  # as of a program that a broken pipe ends
@@ -120,6 +121,13 @@ def main(argv: list[str] | None = None) -> int:
         print(f"mrasfm: error: {_without_control(f'{error.filename}: {error.strerror}')}", file=sys.stderr)
         print("  Check the path and its permissions.", file=sys.stderr)
         return EXIT_BAD_INPUT
+    except MemoryError as error:
+        print(f"mrasfm: error: memory ran out{f': {error}' if str(error) else ''}", file=sys.stderr)
+        print(
+            "  Lower features.max_side_px, features.max_keypoints or threads in the settings, or free memory.",
+            file=sys.stderr,
+        )
+        return EXIT_OUT_OF_MEMORY
     except KeyboardInterrupt:
         print("mrasfm: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED

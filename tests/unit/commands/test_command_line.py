@@ -11,6 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mrasfm_engine import cli
@@ -157,6 +158,19 @@ def test_a_path_that_no_system_has_is_named(
     message = capsys.readouterr().err
     assert message.startswith(f"mrasfm: error: {path}")
     assert message.endswith(": File name too long\n  Check the path and its permissions.\n")
+
+
+def test_memory_that_runs_out_is_told_without_a_stack(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def too_large(*arguments: object, **options: object) -> None:
+        np.empty((10**7, 10**7))
+
+    monkeypatch.setattr("mrasfm_engine.commands.preflight.read_drive", too_large)
+    assert main(["preflight", str(tmp_path)]) == 1
+    message = capsys.readouterr().err
+    assert message.startswith("mrasfm: error: memory ran out: Unable to allocate 728. TiB")
+    assert "features.max_side_px" in message
 
 
 def test_bash_completes_commands_and_options() -> None:
