@@ -125,7 +125,7 @@ def begin_mapping(
 ) -> DriveMapping:
     """Mapping of a drive of which nothing has a pose yet."""
     following, far = split_pairs(pairs)
-    alike = sound_pairs(drive, keypoints, following, config, cancel)
+    alike = sound_pairs(drive, keypoints, following, config.matching, cancel)
     near = alike.pairs
     mapper, still, contradiction = mapper_of_drive(drive, keypoints, near, prior_world_from_rig, config)
     return DriveMapping(

@@ -23,14 +23,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.config import MatchConfig
 from mrasfm_engine.errors import CancelledError
 from mrasfm_engine.geometry.camera_model import pack_cameras
 from mrasfm_engine.matching.image_motion import NEXT_UNITS
 from mrasfm_engine.matching.prior_verification import MAX_WRONG
 from mrasfm_engine.matching.simultaneous import max_error_rad
-from mrasfm_engine.matching.verification import MIN_RANSAC_MATCHES, linear_essential, signed_parallax
-from mrasfm_engine.parallel import mapped
+from mrasfm_engine.matching.verification import signed_parallax
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.triangulation.tracks import Keypoints
@@ -99,7 +98,7 @@ def sound_pairs(
     drive: Drive,
     keypoints: Keypoints,
     pairs: Sequence[PairMatches],
-    config: EngineConfig,
+    config: MatchConfig,
     cancel: Cancel | None = None,
 ) -> SoundPairs:
     """Leave out the matches of following units that meet behind their cameras, and pairs of places that look alike.
@@ -109,23 +108,15 @@ def sound_pairs(
     CancelledError
         Where `cancel` answers True.
     """
-    focal_px = pack_cameras(drive.cameras)[1][:, :2].mean(axis=1)
-
-    def view(pair: PairMatches) -> _TwoViews | None:
+    focal_px, images = pack_cameras(drive.cameras)[1][:, :2].mean(axis=1), drive.images
+    views = {}
+    for n, pair in enumerate(pairs):
         if cancel is not None and cancel():
             raise CancelledError
-        max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config.matching)
-        return _two_views(*_rays(keypoints, pair), max_error=max_error)
-
-    images = drive.images
-    own = [
-        n
-        for n, pair in enumerate(pairs)
-        if images[pair.image_a].camera == images[pair.image_b].camera and pair.inliers.any()
-    ]
-    views = zip(own, mapped(config.threads, view, [pairs[n] for n in own]), strict=True)
-    shown = {n: of_pair for n, of_pair in views if of_pair is not None}
-    return _Judge(drive, pairs, shown, config.matching.min_matches).judged()
+        if pair.essential is not None and images[pair.image_a].camera == images[pair.image_b].camera:
+            max_error = max_error_rad(drive, pair.image_a, pair.image_b, focal_px, config)
+            views[n] = _two_views(pair.essential, *_rays(keypoints, pair), max_error=max_error)
+    return _Judge(drive, pairs, views, config.min_matches).judged()
 
 
 def _rays(keypoints: Keypoints, pair: PairMatches) -> tuple[Floats, Floats]:
@@ -134,11 +125,9 @@ def _rays(keypoints: Keypoints, pair: PairMatches) -> tuple[Floats, Floats]:
     return keypoints.rays[keypoints.first[pair.image_a] + a], keypoints.rays[keypoints.first[pair.image_b] + b]
 
 
-def _two_views(earlier: Floats, later: Floats, *, max_error: float) -> _TwoViews | None:
-    """The motion that inliers (n, 3) show; None where they are too few."""
-    if len(earlier) < MIN_RANSAC_MATCHES:
-        return None
-    *rotations, direction_in_later = cv2.decomposeEssentialMat(linear_essential(earlier, later))
+def _two_views(essential: Floats, earlier: Floats, later: Floats, *, max_error: float) -> _TwoViews:
+    """The motion by an essential matrix, and what inliers (n, 3) say of its direction."""
+    *rotations, direction_in_later = cv2.decomposeEssentialMat(essential)
     # Of the two, one is turned by half a circle about the motion: not what a camera sees the same after.
     turn = np.asarray(max(rotations, key=np.trace), dtype=np.float64)
     pose = np.eye(4)

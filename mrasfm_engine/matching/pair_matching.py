@@ -22,7 +22,7 @@ from mrasfm_engine.matching.simultaneous import (
     rig_of_drive,
     verified_in_rig,
 )
-from mrasfm_engine.matching.verification import essential_inliers
+from mrasfm_engine.matching.verification import fit_essential
 from mrasfm_engine.parallel import in_order
 from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
@@ -182,11 +182,12 @@ class _Search:
         if len(matches) < self._config.min_matches:
             return FEW_MATCHES, across
         ra, rb = self._images.rays(a)[matches[:, 0]], self._images.rays(b)[matches[:, 1]]
-        inliers = essential_inliers(ra, rb, max_error=self.max_error_rad(a, b))
-        if inliers.sum() < self._config.min_matches:
+        fit = fit_essential(ra, rb, max_error=self.max_error_rad(a, b))
+        if fit.inliers.sum() < self._config.min_matches:
             return FEW_INLIERS, across
         # A copy: a matcher may have given a part of a large array.
-        return PairMatches(image_a=a, image_b=b, matches=matches.copy(), inliers=inliers), across
+        found = PairMatches(image_a=a, image_b=b, matches=matches.copy(), inliers=fit.inliers, essential=fit.essential)
+        return found, across
 
     def _count(self, result: PairMatches | str, across: int) -> None:
         self.across_classes += across

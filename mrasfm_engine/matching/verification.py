@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
@@ -16,8 +18,29 @@ CONFIDENCE = 0.9999
 MIN_RANSAC_MATCHES = 8
 
 
+@dataclass(frozen=True, kw_only=True)
+class EssentialFit:
+    """An essential matrix that matches agree with.
+
+    Attributes
+    ----------
+    inliers
+        Those (n,) that do.
+    essential
+        (3, 3), for unit rays b' E a = 0; None where there is none.
+    """
+
+    inliers: Bools
+    essential: Floats | None
+
+
 def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bools:
-    """Return which matches (n,) agree with one essential matrix found by RANSAC.
+    """Return which matches (n,) agree with one essential matrix, see `fit_essential`."""
+    return fit_essential(rays_a, rays_b, max_error=max_error).inliers
+
+
+def fit_essential(rays_a: Floats, rays_b: Floats, *, max_error: float) -> EssentialFit:
+    """The essential matrix that most matches (n,) agree with, found by RANSAC.
 
     Views of less than 150 degrees are judged in the plane z = 1. There an error at the rim of a wider view is tens of
     times what it is at its centre: RANSAC works in planes turned towards the matches, and then all rays are judged by
@@ -32,7 +55,8 @@ def essential_inliers(rays_a: Floats, rays_b: Floats, *, max_error: float) -> Bo
     """
     if len(rays_a) and min(rays_a[:, 2].min(), rays_b[:, 2].min()) < VERY_WIDE:
         return _wide_inliers(rays_a, rays_b, max_error)
-    return _plane_inliers(rays_a, rays_b, max_error)[0]
+    inliers, essential = _plane_inliers(rays_a, rays_b, max_error)
+    return EssentialFit(inliers=inliers, essential=essential)
 
 
 def relative_pose(
@@ -73,11 +97,11 @@ def _plane_inliers(
     return inliers, np.asarray(essential, dtype=np.float64)
 
 
-def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> Bools:
-    """Inliers (n,) of wide views by their angles from the epipolar planes."""
+def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> EssentialFit:
+    """The fit of wide views by angles from the epipolar planes."""
     turn_a, turn_b = _towards(rays_a), _towards(rays_b)
     turned_a, turned_b = rays_a @ turn_a.T, rays_b @ turn_b.T
-    best = np.zeros(len(rays_a), dtype=np.bool_)
+    best = EssentialFit(inliers=np.zeros(len(rays_a), dtype=np.bool_), essential=None)
     central = (turned_a[:, 2] > WIDE) & (turned_b[:, 2] > WIDE)
     everything = np.arange(len(rays_a))
     for rows in (everything,) if central.all() else (np.flatnonzero(central), everything):
@@ -88,12 +112,13 @@ def _wide_inliers(rays_a: Floats, rays_b: Floats, max_error: float) -> Bools:
         for _ in range(REFINEMENTS):
             if inliers.sum() < MIN_RANSAC_MATCHES:
                 break
-            refined = _angles(linear_essential(turned_a[inliers], turned_b[inliers]), turned_a, turned_b) < max_error
+            other = _linear_essential(turned_a[inliers], turned_b[inliers])
+            refined = _angles(other, turned_a, turned_b) < max_error
             if refined.sum() <= inliers.sum():
                 break
-            inliers = refined
-        if inliers.sum() > best.sum():
-            best = inliers
+            inliers, essential = refined, other
+        if inliers.sum() > best.inliers.sum():
+            best = EssentialFit(inliers=inliers, essential=turn_b.T @ essential @ turn_a)
     return best
 
 
@@ -117,7 +142,7 @@ def _angles(essential: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
     return result
 
 
-def linear_essential(rays_a: Floats, rays_b: Floats) -> Floats:
+def _linear_essential(rays_a: Floats, rays_b: Floats) -> Floats:
     """The essential matrix nearest to what solves all equations b' E a = 0 [Hartley and Zisserman, 11.1]."""
     equations = (rays_b[:, :, None] * rays_a[:, None, :]).reshape(len(rays_a), 9)
     _, vectors = np.linalg.eigh(equations.T @ equations)

@@ -60,6 +60,7 @@ class PairMatches:
     matches: NDArray[np.int32]  # (m, 2) keypoint indices, before verification
     inliers: Bools  # (m,) which of them passed geometric verification
     is_revisit: bool = False  # whether their units do not follow one another: a place that is seen again, if it is one
+    essential: Floats | None = None  # (3, 3) that the inliers agree with, for unit rays b' E a = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -21,7 +21,7 @@ from mrasfm_engine.stages._run import Run
 from schemas.artifacts import Stage
 from schemas.findings import as_json
 
-PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit")
+PAIR_ARRAYS = ("ends", "matches", "inliers", "is_revisit", "essential")
 FINDINGS = ("contradiction", "exchanged_cameras", "unexplained")  # parts of the report that are one, or none
 WINDOW_PAIRS = 4096  # written at once: some megabytes, with nearly nothing for headers
 
@@ -153,11 +153,13 @@ def read_pairs(stage: StoredStage) -> list[PairMatches]:
 
 def pack_pairs(pairs: Sequence[PairMatches]) -> Arrays:
     """Matches of all pairs in a few arrays."""
+    none = np.full((3, 3), np.nan)
     return {
         "ends": np.array([(p.image_a, p.image_b, len(p.matches)) for p in pairs], dtype=np.int64).reshape(-1, 3),
         "matches": np.concatenate([p.matches for p in pairs] or [np.zeros((0, 2), np.int32)]),
         "inliers": np.concatenate([p.inliers for p in pairs] or [np.zeros(0, np.bool_)]),
         "is_revisit": np.array([p.is_revisit for p in pairs], dtype=np.bool_),
+        "essential": np.array([none if p.essential is None else p.essential for p in pairs]).reshape(-1, 3, 3),
     }
 
 
@@ -171,6 +173,9 @@ def unpack_pairs(arrays: Arrays) -> list[PairMatches]:
             matches=arrays["matches"][hi - n : hi],
             inliers=arrays["inliers"][hi - n : hi],
             is_revisit=bool(is_revisit),
+            essential=None if np.isnan(essential).any() else essential,
         )
-        for (a, b, n), hi, is_revisit in zip(arrays["ends"], stops, arrays["is_revisit"], strict=True)
+        for (a, b, n), hi, is_revisit, essential in zip(
+            arrays["ends"], stops, arrays["is_revisit"], arrays["essential"], strict=True
+        )
     ]

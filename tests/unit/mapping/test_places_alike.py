@@ -14,6 +14,7 @@ from mrasfm_engine.geometry import se3
 from mrasfm_engine.mapping.components import Component, map_drive
 from mrasfm_engine.mapping.mapping_report import describe, places_alike_findings
 from mrasfm_engine.mapping.places_alike import SoundPairs, sound_pairs
+from mrasfm_engine.matching.verification import fit_essential
 from mrasfm_engine.scene.scene import ImageFeatures, PairMatches
 from tests.helpers.simulated_drive import (
     SimulatedDrive,
@@ -72,7 +73,7 @@ def matches(
 ) -> list[PairMatches]:
     """True matches, of which some share is with the copy one period farther on; that depends on the pair and on how
     many units lie between its images."""
-    rng, result = np.random.default_rng(seed), []
+    rng, result, keypoints = np.random.default_rng(seed), [], keypoints_of(simulated, CONFIG)
     for pair in true_matches(simulated, window=window):
         of_a, of_b = (simulated.point_of_keypoint[image] for image in (pair.image_a, pair.image_b))
         units = [simulated.drive.images[image].unit for image in (pair.image_a, pair.image_b)]
@@ -83,7 +84,12 @@ def matches(
         rows[copied, 1] = copy[copied]
         rows = rows[(rows[:, 1] >= 0)]
         if len(rows) >= 15:
-            result.append(replace(pair, matches=rows, inliers=np.ones(len(rows), dtype=np.bool_)))
+            rays = [
+                keypoints.rays[keypoints.first[k] + of]
+                for k, of in zip((pair.image_a, pair.image_b), rows.T, strict=True)
+            ]
+            fit = fit_essential(*rays, max_error=2.0 / simulated.truth.camera_params[0, 0])
+            result.append(replace(pair, matches=rows, inliers=fit.inliers, essential=fit.essential))
     return result
 
 
@@ -95,7 +101,7 @@ def is_true(simulated: SimulatedDrive, pair: PairMatches) -> np.ndarray:
 
 
 def judged(simulated: SimulatedDrive, pairs: Sequence[PairMatches]) -> SoundPairs:
-    return sound_pairs(simulated.drive, keypoints_of(simulated, CONFIG), pairs, CONFIG)
+    return sound_pairs(simulated.drive, keypoints_of(simulated, CONFIG), pairs, CONFIG.matching)
 
 
 def inliers(pairs: Sequence[PairMatches]) -> int:
@@ -219,7 +225,7 @@ def test_it_can_be_cancelled() -> None:
     simulated = along_facades()
     pairs = matches(simulated, lambda pair, gap: 0.0)
     with pytest.raises(CancelledError):
-        sound_pairs(simulated.drive, keypoints_of(simulated, CONFIG), pairs, CONFIG, lambda: True)
+        sound_pairs(simulated.drive, keypoints_of(simulated, CONFIG), pairs, CONFIG.matching, lambda: True)
 
 
 def mapped(simulated: SimulatedDrive, pairs: Sequence[PairMatches]) -> Component:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, in_front_of_both
+from mrasfm_engine.matching.verification import epipolar_errors, essential_inliers, fit_essential, in_front_of_both
 
 FOCAL_PX = 700.0
 
@@ -95,6 +95,26 @@ def test_true_matches_at_the_rim_of_fisheyes_survive(seed: int, looks_aside: boo
     clearly_wrong = wrong[epipolar_errors(b_from_a, a[wrong], b[wrong]) > 6.0 / 300.0]
     assert len(clearly_wrong) > 60
     assert inliers[clearly_wrong].mean() < 0.08
+
+
+@pytest.mark.parametrize("looks_aside", [None, False, True])
+def test_the_essential_matrix_is_that_of_the_motion(looks_aside: bool | None) -> None:
+    """Of usual views and of fisheyes, which are judged in turned planes."""
+    if looks_aside is None:
+        b_from_a, _, a, b = two_views(300)
+        a, b = noisy(a, 0.4, np.random.default_rng(0)), noisy(b, 0.4, np.random.default_rng(1))
+    else:
+        b_from_a, a, b = fisheye_views(1000, 0, looks_aside=looks_aside)
+    essential = fit_essential(a, b, max_error=2.0 / 300.0).essential
+    assert essential is not None
+    true = se3.skew(b_from_a[:3, 3]) @ b_from_a[:3, :3]
+    cosine = (essential * true).sum() / np.linalg.norm(essential) / np.linalg.norm(true)
+    assert abs(cosine) > 0.9998
+
+
+def test_without_an_essential_matrix_there_is_none() -> None:
+    _, _, a, b = two_views(5)
+    assert fit_essential(a, b, max_error=0.01).essential is None
 
 
 def test_exact_rays_have_no_epipolar_error() -> None:
