@@ -121,8 +121,9 @@ def sound_pairs(
 
 def _rays(keypoints: Keypoints, pair: PairMatches) -> tuple[Floats, Floats]:
     """Viewing rays (n, 3) of a pair's inliers."""
-    a, b = pair.matches[pair.inliers].T
-    return keypoints.rays[keypoints.first[pair.image_a] + a], keypoints.rays[keypoints.first[pair.image_b] + b]
+    a, b = pair.matches[pair.inliers].T.astype(np.int64)
+    first = keypoints.first
+    return keypoints.rays.take(first[pair.image_a] + a, axis=0), keypoints.rays.take(first[pair.image_b] + b, axis=0)
 
 
 def _two_views(essential: Floats, earlier: Floats, later: Floats, *, max_error: float) -> _TwoViews:

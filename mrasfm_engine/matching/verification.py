@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.colmap_cameras import MIN_FORWARD
+from mrasfm_engine.jit import njit
 from mrasfm_engine.types import Bools, Floats
 
 # z of unit rays 60 and 75 degrees off the axis: beyond, an error counts over 4 and 15 times in the plane z = 1.
@@ -16,6 +19,7 @@ WIDE, VERY_WIDE = 0.5, 0.26
 REFINEMENTS = 3
 CONFIDENCE = 0.9999
 MIN_RANSAC_MATCHES = 8
+MIN_NORMAL = 1e-12  # length of what has no direction
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -174,14 +178,27 @@ def signed_parallax(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Floats:
 
     Of a ray's two planes, with either camera's ray, the one that says less; zero where rays are parallel.
     """
-    ra, t = rays_a @ b_from_a[:3, :3].T, b_from_a[:3, 3]
-    between = np.cross(rays_b, ra)
-    by_ray = []
-    for rays in (ra, rays_b):
-        normal = np.cross(t, rays)
-        by_ray.append((between * normal).sum(1) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12))
-    result: Floats = np.minimum(*by_ray)
+    result = np.empty(len(rays_a))
+    _signed_parallax(np.ascontiguousarray(b_from_a), rays_a, rays_b, result)
     return result
+
+
+@njit(cache=True, nogil=True)
+def _signed_parallax(b_from_a: Any, rays_a: Any, rays_b: Any, out: Any) -> None:
+    tx, ty, tz = b_from_a[0, 3], b_from_a[1, 3], b_from_a[2, 3]
+    for n in range(len(out)):
+        ax, ay, az = rays_a[n, 0], rays_a[n, 1], rays_a[n, 2]
+        bx, by, bz = rays_b[n, 0], rays_b[n, 1], rays_b[n, 2]
+        px = b_from_a[0, 0] * ax + b_from_a[0, 1] * ay + b_from_a[0, 2] * az
+        py = b_from_a[1, 0] * ax + b_from_a[1, 1] * ay + b_from_a[1, 2] * az
+        pz = b_from_a[2, 0] * ax + b_from_a[2, 1] * ay + b_from_a[2, 2] * az
+        # Between both rays, and the normals of their planes.
+        wx, wy, wz = by * pz - bz * py, bz * px - bx * pz, bx * py - by * px
+        ux, uy, uz = ty * pz - tz * py, tz * px - tx * pz, tx * py - ty * px
+        vx, vy, vz = ty * bz - tz * by, tz * bx - tx * bz, tx * by - ty * bx
+        of_a = (wx * ux + wy * uy + wz * uz) / max(math.sqrt(ux * ux + uy * uy + uz * uz), MIN_NORMAL)
+        of_b = (wx * vx + wy * vy + wz * vz) / max(math.sqrt(vx * vx + vy * vy + vz * vz), MIN_NORMAL)
+        out[n] = min(of_a, of_b)
 
 
 def in_front_of_both(b_from_a: Floats, rays_a: Floats, rays_b: Floats) -> Bools:
