@@ -14,6 +14,7 @@ from mrasfm_engine.bundle_adjustment.priors import RotationPrior, Term, UprightP
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
+from mrasfm_engine.mapping.clock_leap import ClockLeap, find_clock_leap
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
@@ -62,6 +63,7 @@ class AbsolutePriors:
     rough_fault: str = ""
     placed_by_rough_poses: bool = False
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
+    clock_leap: ClockLeap | None = None  # of that clock, behind or before which positions take no part
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
     @staticmethod
@@ -111,7 +113,8 @@ class AbsolutePriors:
         """Move the scene to where positions say, by the clock that they show once it is there."""
         if self.gnss is None or self.antenna_in_rig_m is None:
             return
-        for _ in range(CLOCK_ROUNDS):
+        rounds = CLOCK_ROUNDS
+        while rounds:
             self.placement = place_by_gnss(
                 mapper,
                 self.gnss,
@@ -121,8 +124,10 @@ class AbsolutePriors:
                 thorough=True,
                 clock=self.clock,
             )
+            leap = self.clock_leap
             if not self._set_clock(mapper):
                 break
+            rounds = rounds - 1 if self.clock_leap is leap else CLOCK_ROUNDS
 
     def _place_by_rough_poses(self, mapper: Mapper) -> None:
         """Move the scene to where rough poses say, if positions do not and if they have its shape."""
@@ -193,10 +198,27 @@ class AbsolutePriors:
         before, found = self.clock, find_clock(mapper, self.placement)
         found = found if found is not None and found.is_wrong else None
         if found is before or (found is not None and before is not None and found.is_as(before)):
-            return False
+            return found is not None and self._leave_a_side_of_a_leap(mapper)
         offset_s, before_s = (0.0 if clock is None else clock.offset_s for clock in (found, before))
         self.gnss, self.clock = self.gnss.later_by(offset_s - before_s), found
         self.placement = replace(self.placement, track=self.gnss, clock=found)
+        return True
+
+    def _leave_a_side_of_a_leap(self, mapper: Mapper) -> bool:
+        """Do without the positions on one side of a leap of the clock, where one offset does not explain all of them.
+
+        The other side's clock may be right: it is judged anew.
+        """
+        assert self.gnss is not None
+        assert self.placement is not None
+        if self.clock_leap is not None:
+            return False
+        self.clock_leap = find_clock_leap(mapper, self.placement)
+        if self.clock_leap is None:
+            return False
+        used = self.clock_leap.used(self.gnss)
+        self.gnss, self.clock = used.later_by(0.0 if self.clock is None else -self.clock.offset_s), None
+        self.placement = replace(self.placement, track=self.gnss, clock=None)
         return True
 
     def _renew_rough(self, mapper: Mapper) -> None:

@@ -283,6 +283,13 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
             result["gnss"] |= clock
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}
+    leap = refinement.absolute.clock_leap
+    if leap is not None and placement is not None:
+        result["gnss"]["clock_leap"] = {
+            "between_us": [leap.last_before_us, leap.first_behind_us],
+            "leap_s": leap.seconds,
+            "used": "after" if leap.later_is_used else "before",
+        }
     return result
 
 

@@ -261,10 +261,12 @@ def positions_of_units(mapper: Mapper, placement: Placement, units: Ints) -> Rec
     """The term of the positions of some units, but for those that were outliers as they were assessed last."""
     units = units[np.isfinite(placement.known_m[units, 0])]
     units = units[~np.isin(units, placement.units[~placement.inlier])]
-    return _as_term(mapper, placement, units, placement.errors)
+    return positions_with_errors(mapper, placement, units, placement.errors)
 
 
-def _as_term(mapper: Mapper, placement: Placement, units: Ints, errors: ReceiverErrors) -> ReceiverPositions:
+def positions_with_errors(
+    mapper: Mapper, placement: Placement, units: Ints, errors: ReceiverErrors
+) -> ReceiverPositions:
     """Positions of some units with errors of a certain size."""
     sigma_m, settings = placement.known_sigma_m[units], mapper.config.gnss
     segment = segment_of(units, placement.jumps)

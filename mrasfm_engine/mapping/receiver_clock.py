@@ -61,13 +61,31 @@ def clock_offset(
     """
     if len(antenna_m) < MIN_POSITIONS_FOR_CLOCK:
         return None
-    positions = replace(positions, clock_m=None)
-    velocity = np.gradient(antenna_m, positions.time_s, axis=0)[:, :, None]
-    off_m = (positions.position_m - antenna_m)[:, :, None]
+    moves = track_motions(antenna_m, positions.time_s)
+    fitted = fit_motions(antenna_m, positions, moves, factor=factor, sigma_factor=sigma_factor)
+    if fitted is None:
+        return None
+    solution, covariance = fitted
+    return ReceiverClock(offset_s=float(solution[0]), sigma_s=float(np.sqrt(covariance[0, 0])))
+
+
+def track_motions(antenna_m: Floats, time_s: Floats) -> Floats:
+    """Ways (n, 3, 6) in which places (n, 3) move: by a second of a clock, by growth, along axes, about the vertical."""
+    velocity = np.gradient(antenna_m, time_s, axis=0)[:, :, None]
     centred_m = antenna_m - antenna_m.mean(0)
-    yaw = -se3.skew(centred_m)[:, :, [2]]
-    shift = np.tile(np.eye(3), (len(antenna_m), 1, 1))
-    known = positions.information(np.concatenate([velocity, centred_m[:, :, None], shift, yaw, off_m], axis=2))
+    shift, yaw = np.tile(np.eye(3), (len(antenna_m), 1, 1)), -se3.skew(centred_m)[:, :, [2]]
+    return np.concatenate([velocity, centred_m[:, :, None], shift, yaw], axis=2)
+
+
+def fit_motions(
+    antenna_m: Floats, positions: ReceiverPositions, moves: Floats, *, factor: float, sigma_factor: float
+) -> tuple[Floats, Floats] | None:
+    """Sizes (k,) of the moves (n, 3, k) of places that fit measured positions best, and their covariance (k, k).
+
+    See `clock_offset` for the factor, of the second of them. None where nothing tells one of them.
+    """
+    off_m = (positions.position_m - antenna_m)[:, :, None]
+    known = replace(positions, clock_m=None).information(np.concatenate([moves, off_m], axis=2))
     known[1, 1] += sigma_factor**-2
     known[1, -1] += (factor - 1.0) * sigma_factor**-2
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[:-1], 1e-12))
@@ -76,8 +94,7 @@ def clock_offset(
         return None
     solution = np.linalg.solve(matrix, right)
     noise = max(1.0, float(known[-1, -1] - right @ solution) / off_m.size)
-    sigma_s = float(np.sqrt(noise * np.linalg.inv(matrix)[0, 0]) * scale[0])
-    return ReceiverClock(offset_s=float(solution[0] * scale[0]), sigma_s=sigma_s)
+    return solution * scale, noise * np.linalg.inv(matrix) * np.outer(scale, scale)
 
 
 def clock_findings(clock: ReceiverClock | None) -> list[Finding]:

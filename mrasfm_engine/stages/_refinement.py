@@ -16,6 +16,7 @@ from mrasfm_engine.io.plain_json import plain
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.mapping import gaps, mapping_report, miscalibration
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.clock_leap import clock_leap_findings
 from mrasfm_engine.mapping.implausible_lengths import length_findings
 from mrasfm_engine.mapping.impossible_motion import motion_jump_findings
 from mrasfm_engine.mapping.keyframes import register_between_keyframes
@@ -152,6 +153,7 @@ def _refined(
         findings += refined.placement.findings
         findings += refusal_findings(refined.placement) + jump_findings(mapper, refined.placement)
         findings += outlier_findings(refined.placement)
+    findings += clock_leap_findings(refined.absolute.clock_leap, int(mapper.drive.timestamps_us[0]))
     findings += rough_scale_findings(mapper, refined.scale_of_rough_poses)
     findings += rough_shape_findings(refined.absolute.rough_fault)
     if refined.intrinsics is not None:
