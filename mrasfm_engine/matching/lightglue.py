@@ -77,9 +77,16 @@ class ColmapLightGlueMatcher(LightGlueMatcher):
 
     def _run(self, a: Prepared, b: Prepared) -> tuple[Ints, Floats32]:
         found = self.network.run({**self._feed(a, b), "image_size0": a.size, "image_size1": b.size})
-        partner = found["matches0"].astype(np.int64)
+        partner, scores = found["matches0"], found["mscores0"]
+        are_indices = partner.shape == scores.shape == (a.count,) and (np.abs(partner) <= b.count).all()  # no NaN is
+        if not are_indices:
+            raise self._bad(
+                f"partners {list(partner.shape)} with scores {list(scores.shape)} that are not one for each of its "
+                f"{a.count} keypoints, among {b.count} others",
+                "Export it so that it takes any number of keypoints and gives indices of both, without padding.",
+            )
         matched = np.flatnonzero(partner >= 0)
-        return np.stack([matched, partner[matched]], axis=1), found["mscores0"][matched]
+        return np.stack([matched, partner[matched].astype(np.int64)], axis=1), scores[matched]
 
 
 def _build(config: MatchConfig, network: Network, model: KnownModel) -> NetworkMatcher:

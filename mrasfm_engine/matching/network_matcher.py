@@ -57,18 +57,31 @@ class NetworkMatcher:
             return np.zeros((0, 2), np.int32)
         pairs, scores = self._run(a, b)
         self._check(pairs, scores, (a.count, b.count))
-        return np.ascontiguousarray(pairs[scores >= self._min_score], dtype=np.int32)
+        kept = pairs[scores >= self._min_score]
+        if any(len(np.unique(of_image)) < len(of_image) for of_image in kept.T):
+            raise self._bad(
+                "a keypoint more than one partner", "Export it with matches that are each other's best, and no others."
+            )
+        return np.ascontiguousarray(kept, dtype=np.int32)
 
     def _check(self, pairs: Ints, scores: Floats32, counts: tuple[int, int]) -> None:
         """An index that is out of range would else be some other keypoint's, or an error without a name."""
         fits = pairs.ndim == 2 and pairs.shape[1] == 2 and scores.shape == pairs.shape[:1]
         if not fits or (len(pairs) and (pairs.min() < 0 or (pairs.max(axis=0) >= counts).any())):
-            raise InputError(
-                f"model {self.network.name} gives matches {list(pairs.shape)} with scores {list(scores.shape)} that "
-                f"are not between its {counts[0]} and {counts[1]} keypoints",
-                remedy="Export it so that it takes any number of keypoints and gives indices of both, without padding.",
-                code="bad-model",
+            raise self._bad(
+                f"matches {list(pairs.shape)} with scores {list(scores.shape)} that are not between its {counts[0]} "
+                f"and {counts[1]} keypoints",
+                "Export it so that it takes any number of keypoints and gives indices of both, without padding.",
             )
+        if not np.isfinite(scores).all():
+            raise self._bad(
+                "scores that are not finite numbers",
+                "Export it in 32 bit floats: in 16 bits, values over 65504 are infinite. Damaged weights do this as "
+                "well.",
+            )
+
+    def _bad(self, gives: str, remedy: str) -> InputError:
+        return InputError(f"model {self.network.name} gives {gives}", remedy=remedy, code="bad-model")
 
     def _units(self, xy_px: Floats32, size: Floats32) -> Floats32:
         """Keypoints as LightGlue was trained: about the image's centre, half the longer side the unit."""

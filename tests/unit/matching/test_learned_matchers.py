@@ -129,3 +129,44 @@ def test_matches_that_are_none_are_refused(
     five = features(unit(np.random.default_rng(0), 5, 256))
     with pytest.raises(InputError, match="model padded gives matches"):
         matched(LightGlueMatcher(network, MatchConfig()), five, five)
+
+
+@pytest.mark.parametrize(
+    ("pairs", "scores", "what"),
+    [
+        ([[0, 1], [2, 3]], [0.9, np.nan], "scores that are not finite numbers"),
+        ([[0, 1], [2, 3]], [0.9, np.inf], "scores that are not finite numbers"),
+        ([[0, 1], [0, 2]], [0.9, 0.9], "a keypoint more than one partner"),
+        ([[0, 1], [2, 1]], [0.9, 0.9], "a keypoint more than one partner"),
+    ],
+)
+def test_matches_that_say_nothing_are_refused(
+    pairs: list[list[int]], scores: list[float], what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = Network("odd", learned_graphs.lightglue(), gpu=False)
+    given = {"matches0": np.array(pairs), "mscores0": np.array(scores, np.float32)}
+    monkeypatch.setattr(network, "run", lambda feed: given)
+    five = features(unit(np.random.default_rng(0), 5, 256))
+    with pytest.raises(InputError, match=f"model odd gives {what}"):
+        matched(LightGlueMatcher(network, MatchConfig()), five, five)
+
+
+@pytest.mark.parametrize(
+    ("partners", "scores"),
+    [
+        ([np.nan, 1, 2, 3, 4], [0.9] * 5),
+        ([1e30, 1, 2, 3, 4], [0.9] * 5),
+        ([0, 1, 2, 3, 4], [0.9] * 4),
+        ([0, 1, 2, 3], [0.9] * 4),
+        ([0, 1, 2, 3, 5], [0.9] * 5),  # there are five
+    ],
+)
+def test_partners_that_are_no_keypoints_are_refused(
+    partners: list[float], scores: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = Network("odd", learned_graphs.colmap_lightglue(), gpu=False)
+    given = {"matches0": np.array(partners, np.float32), "mscores0": np.array(scores, np.float32)}
+    monkeypatch.setattr(network, "run", lambda feed: given)
+    five = features(unit(np.random.default_rng(0), 5, 8))
+    with pytest.raises(InputError, match="model odd gives"):
+        matched(ColmapLightGlueMatcher(network, MatchConfig()), five, five)
