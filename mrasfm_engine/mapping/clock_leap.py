@@ -85,7 +85,9 @@ def find_clock_leap(mapper: Mapper, placement: Placement) -> ClockLeap | None:
     )
     if fitted is None:
         return None
-    seconds, sigma_s = float(fitted[0][-1]), float(np.sqrt(fitted[1][-1, -1]))
+    # A scene that bends moves one side against the other as well.
+    bent_s = BENDS[0] * extent_m(antenna_m) / float(np.sqrt((moves[:, :, 0] ** 2).sum(axis=1).mean()))
+    seconds, sigma_s = float(fitted[0][-1]), float(np.hypot(np.sqrt(fitted[1][-1, -1]), bent_s))
     if not _is_probable(seconds, sigma_s, places=len(units) - 2 * AROUND):
         return None
     at_us, margin_us = mapper.drive.timestamps_us[units], round(1e6 * abs(seconds))
