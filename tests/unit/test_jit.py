@@ -51,10 +51,12 @@ class Pair(NamedTuple):
 def made(other):
     return Pair(0, other)
 """
+# A file's time is that of the kernel's last tick, up to 10 ms ago: in the same one, it would not seem to have changed.
 CHANGED = """
-import pathlib
+import pathlib, time
 constants = pathlib.Path("mrasfm_engine/constants.py")
 import mrasfm_engine.constants, mrasfm_engine.jit
+time.sleep(0.02)
 constants.write_text("SHIFT = 5")
 """
 # To import numba takes most of a process's time: each run is a fork of one that has.
