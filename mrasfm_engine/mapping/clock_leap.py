@@ -14,8 +14,8 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines
 from mrasfm_engine.mapping.georeferencing import BENDS, assess_residuals
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import extent_m, positions_with_errors
-from mrasfm_engine.mapping.receiver_clock import fit_motions, track_motions
+from mrasfm_engine.mapping.placement import beside_a_bent_scene, extent_m, positions_with_errors
+from mrasfm_engine.mapping.receiver_clock import fit_motions, is_probable, track_motions
 from mrasfm_engine.mapping.receiver_fit import Placement, antenna_places_m, most_likely_errors
 from mrasfm_engine.mapping.receiver_jumps import AROUND
 from mrasfm_engine.types import Floats
@@ -78,7 +78,7 @@ def find_clock_leap(mapper: Mapper, placement: Placement) -> ClockLeap | None:
     positions = positions_with_errors(mapper, placement, units[inlier], errors)
     fitted = fit_motions(
         antenna_m[inlier],
-        replace(positions, wander_m=np.hypot(positions.wander_m, BENDS[0] * extent_m(antenna_m))),
+        beside_a_bent_scene(positions, antenna_m),
         np.concatenate([moves, by_leap], axis=2)[inlier],
         factor=1.0 / of_rig,
         sigma_factor=sigma_factor,
@@ -88,7 +88,8 @@ def find_clock_leap(mapper: Mapper, placement: Placement) -> ClockLeap | None:
     # A scene that bends moves one side against the other as well.
     bent_s = BENDS[0] * extent_m(antenna_m) / float(np.sqrt((moves[:, :, 0] ** 2).sum(axis=1).mean()))
     seconds, sigma_s = float(fitted[0][-1]), float(np.hypot(np.sqrt(fitted[1][-1, -1]), bent_s))
-    if not _is_probable(seconds, sigma_s, places=len(units) - 2 * AROUND):
+    odds = LEAP_SHARE / (1.0 - LEAP_SHARE) / (len(units) - 2 * AROUND)  # at any of so many places
+    if not is_probable(seconds, sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_LEAP_S):
         return None
     at_us, margin_us = mapper.drive.timestamps_us[units], round(1e6 * abs(seconds))
     return ClockLeap(
@@ -97,13 +98,6 @@ def find_clock_leap(mapper: Mapper, placement: Placement) -> ClockLeap | None:
         seconds=seconds,
         later_is_used=bool(inlier[best:].sum() > inlier[:best].sum()),
     )
-
-
-def _is_probable(seconds: float, sigma_s: float, *, places: int) -> bool:
-    """True where a leap at one of some places is more probable than none [the odds of Bayes' theorem]."""
-    of_leap = float(np.hypot(sigma_s, SIGMA_OF_LEAP_S))
-    odds = LEAP_SHARE / (1.0 - LEAP_SHARE) / places * sigma_s / of_leap
-    return bool(np.log(odds) + 0.5 * seconds**2 * (sigma_s**-2 - of_leap**-2) > 0.0)
 
 
 def clock_leap_findings(leap: ClockLeap | None, start_us: int) -> list[Finding]:

@@ -416,10 +416,15 @@ def _clock_offset(mapper: Mapper, positions: ReceiverPositions) -> ReceiverClock
     of_rig, sigma_rig = scale_of_baselines(mapper)
     return clock_offset(
         antenna_m,
-        replace(positions, wander_m=np.hypot(positions.wander_m, BENDS[0] * extent_m(antenna_m))),
+        beside_a_bent_scene(positions, antenna_m),
         factor=1.0 / of_rig,
         sigma_factor=np.inf if mapper.drive.has_single_camera else sigma_rig,
     )
+
+
+def beside_a_bent_scene(positions: ReceiverPositions, antenna_m: Floats) -> ReceiverPositions:
+    """The positions with errors that wander by as much as a scene with the antenna at some places (n, 3) may bend."""
+    return replace(positions, wander_m=np.hypot(positions.wander_m, BENDS[0] * extent_m(antenna_m)))
 
 
 def _growth_by_term(mapper: Mapper, placement: Placement) -> float:

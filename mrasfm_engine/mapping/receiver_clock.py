@@ -37,13 +37,22 @@ class ReceiverClock:
     @property
     def is_wrong(self) -> bool:
         """True where it is more probable that it is wrong than that it is right [the odds of Bayes' theorem]."""
-        of_wrong = np.hypot(self.sigma_s, SIGMA_OF_WRONG_CLOCK_S)
-        squared = self.offset_s**2 * (self.sigma_s**-2 - of_wrong**-2)
-        return bool(np.log(WRONG_SHARE / (1.0 - WRONG_SHARE) * self.sigma_s / of_wrong) + 0.5 * squared > 0.0)
+        odds = WRONG_SHARE / (1.0 - WRONG_SHARE)
+        return is_probable(self.offset_s, self.sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_WRONG_CLOCK_S)
 
     def is_as(self, other: ReceiverClock) -> bool:
         """True where both agree but for less than their sigmas can tell."""
         return abs(self.offset_s - other.offset_s) < STEADY_SIGMAS * self.sigma_s
+
+
+def is_probable(seconds: float, sigma_s: float, *, odds: float, sigma_of_wrong_s: float) -> bool:
+    """True where an error of a clock, as estimated, is more probable than none [the odds of Bayes' theorem].
+
+    `odds` are those before positions say anything, and errors then are normal with `sigma_of_wrong_s`.
+    """
+    of_wrong = np.hypot(sigma_s, sigma_of_wrong_s)
+    squared = seconds**2 * (sigma_s**-2 - of_wrong**-2)
+    return bool(np.log(odds * sigma_s / of_wrong) + 0.5 * squared > 0.0)
 
 
 def clock_offset(
