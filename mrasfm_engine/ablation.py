@@ -247,9 +247,7 @@ def warm_up(
     run: stages.Run, features: Sequence[ImageFeatures], matches: Sequence[PairMatches], prior: PriorTrajectory
 ) -> None:
     """Map and refine the first units, so that no row's time has the loading of compiled code in it."""
-    few = Drive(
-        run.drive.root, run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[:WARM_UP_UNITS]})
-    )
+    few = run.drive.part(range(WARM_UP_UNITS))
     images = len(few.images)
     bands = RowBands.from_drive(few, compensate=run.config.mapping.motion_compensation)
     among_them = [pair for pair in matches if pair.image_b < images]

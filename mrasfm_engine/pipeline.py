@@ -20,7 +20,7 @@ from mrasfm_engine.io.read_map import is_map
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.submaps import Span, Submap
-from mrasfm_engine.types import StageProgress
+from mrasfm_engine.types import BringFile, StageProgress
 from schemas.artifacts import Stage
 
 
@@ -33,6 +33,7 @@ def reconstruct(
     cancel: Callable[[], bool] = lambda: False,
     is_new: bool = False,
     content_sha256: Mapping[str, str] | None = None,
+    bring: BringFile | None = None,
     force: bool = False,
 ) -> dict[str, Any]:
     """Reconstruct a drive and write the scene into the folder `out`.
@@ -53,6 +54,9 @@ def reconstruct(
     content_sha256
         SHA-256 of the drive's files by name, where the caller knows them: finished stages are found again by the
         contents of their input. Else the files are read for it.
+    bring
+        For a drive that is larger than the disk: called with the name of an image or mask, in any thread, each time
+        before it is read. Without it `drive_folder` holds all of them.
     force
         Whether the scene may replace that of another drive in `out`.
 
@@ -73,7 +77,7 @@ def reconstruct(
             code="not-a-scene",
         )
     require_free(out, result="scene")
-    drive = read_drive(drive_folder, is_new=is_new)
+    drive = read_drive(drive_folder, is_new=is_new, bring=bring)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
     run.report["drive"] = drive.manifest.name
     run.report["settings"] = config.model_dump(mode="json")
@@ -109,6 +113,7 @@ def plan_submaps(
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
     content_sha256: Mapping[str, str] | None = None,
+    bring: BringFile | None = None,
 ) -> list[Submap]:
     """Check a drive and cut it into sub-maps, which any processes may do by `reconstruct_submap` before `reconstruct`.
 
@@ -129,7 +134,7 @@ def plan_submaps(
     InputError, ReconstructionError, StorageError, CancelledError
         As `reconstruct`, whose other parameters these are.
     """
-    drive = read_drive(drive_folder)
+    drive = read_drive(drive_folder, bring=bring)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256)
     if stages.count_of_submaps(run, workers) == 1:
         return []  # all of this is left to `reconstruct`
@@ -155,6 +160,7 @@ def reconstruct_submap(
     progress: StageProgress = lambda stage, done, total: None,
     cancel: Callable[[], bool] = lambda: False,
     content_sha256: Mapping[str, str] | None = None,
+    bring: BringFile | None = None,
 ) -> dict[str, Any]:
     """Extract, match and map one of the sub-maps that `plan_submaps` made; its finished stages stay in `out/.stages`.
 
@@ -171,7 +177,7 @@ def reconstruct_submap(
         As `reconstruct`, whose other parameters these are. A sub-map in which nothing can be mapped is no error: its
         units may be those of a tunnel.
     """
-    drive = read_drive(drive_folder)
+    drive = read_drive(drive_folder, bring=bring)
     run = stages.Run(drive, config, stages.store_of(out), progress, cancel, content_sha256, is_planned=True)
     with watched_compilation():
         stages.load_models(run)
@@ -191,10 +197,12 @@ def reconstruct_submap(
 def _begun(run: stages.Run, workers: int = 1) -> tuple[PriorTrajectory, list[Span]]:
     """Everything before the long work: the prior trajectory of the units that are mapped, and the cut of the drive."""
     stages.load_models(run)
-    stages.preflight(run)
+    findings = stages.preflight(run)
     prior = stages.leave_out_standing(run, stages.prior(run))
     was_cut = stages.is_cut(run)
     spans = stages.cut_drive(run, workers)
+    if spans:
+        stages.keep_preflight(run, findings)
     stages.own_cars(run)
     stages.extraction_sizes(run)
     if not was_cut:  # else the probe came before

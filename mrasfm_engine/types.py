@@ -16,4 +16,5 @@ Bytes = NDArray[np.uint8]  # also images: (h, w) grey values, or (h, w, 3) red, 
 
 CountProgress = Callable[[int, int], None]  # done, total
 StageProgress = Callable[[str, int, int], None]  # stage, done, total; 0 of 0 is its beginning, 1 of 1 its end
+BringFile = Callable[[str], None]  # puts a file of a drive, by its name, into the drive's folder
 Cancel = Callable[[], bool]  # true as soon as the work is no longer wanted

@@ -64,7 +64,7 @@ def checkpoint_file(name: str) -> str:
 
 SUBMAP_STAGES = (Stage.FEATURES, Stage.MATCHES, Stage.MAPPING)  # of one sub-map of a long drive, in their order
 # What is done of a long drive before it is cut: names of checkpoints.
-PLAN_CHECKPOINTS = ("standing", "extraction-size", "own-car", "submaps")
+PLAN_CHECKPOINTS = ("preflight", "standing", "extraction-size", "own-car", "submaps")
 
 
 def submap_checkpoint(number: int, stage: str) -> str:

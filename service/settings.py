@@ -196,6 +196,11 @@ class Settings(BaseSettings):
     job_timeout_seconds: Seconds = Field(24 * 3600.0, description="of one attempt")
     terminate_after_seconds: Seconds = Field(10.0, description="time from a cancel to SIGTERM")
     kill_after_seconds: Seconds = Field(30.0, description="time from a cancel to SIGKILL")
+    drive_room_bytes: Bytes = Field(
+        10_000_000_000,
+        description="disk that a drive's files take in one worker process at one time, where the artifact store is not "
+        "a folder: files of a larger drive come as they are needed",
+    )
     engine_threads: Annotated[int, Field(ge=0, le=1024)] = Field(
         0, description="threads of one reconstruction; 0: all cores"
     )
@@ -272,6 +277,11 @@ class Settings(BaseSettings):
     def resolved_artifacts_url(self) -> str:
         """The artifact store's URL."""
         return self.artifacts_url or "file://" + quote(str(self.data_dir.resolve() / "artifacts"))
+
+    @property
+    def stores_in_folder(self) -> bool:
+        """True where the artifact store is a folder, from which files come without being copied."""
+        return self.resolved_artifacts_url.startswith("file://")
 
     @cached_property
     def spool_dir(self) -> Path:

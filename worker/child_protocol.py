@@ -25,6 +25,14 @@ class Work(StrEnum):
 
 
 @dataclass(frozen=True, kw_only=True)
+class FileAddress:
+    """Port on the loopback interface at which the supervisor is asked for files, and the word that shows who may ask."""
+
+    port: int
+    token: str
+
+
+@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """The work of one attempt.
 
@@ -34,6 +42,8 @@ class Attempt:
         Folder with `drive.json` and the files it names; None for an aggregation.
     content_sha256
         SHA-256 of these files by name: what finished stages are found again by.
+    files
+        Where the drive's files are asked for; None where all that are needed are in its folder.
     settings
         As in the API's `ReconstructionSettings`.
     name
@@ -59,6 +69,7 @@ class Attempt:
     settings: Mapping[str, Any]
     drive: Path | None = None
     content_sha256: Mapping[str, str] | None = None
+    files: FileAddress | None = None
     name: str = ""
     scenes: Mapping[str, Path] = field(default_factory=dict)
     into: Path | None = None
@@ -110,6 +121,7 @@ class ChildRequest(Attempt):
         values["work"] = Work(values["work"])
         for name in ("drive", "into", "source", "out", "cancel_file", "result_file"):
             values[name] = None if values[name] is None else Path(values[name])
+        values["files"] = None if values["files"] is None else FileAddress(**values["files"])
         for name in ("scenes", "drives"):
             values[name] = {key: Path(folder) for key, folder in values[name].items()}
         return cls(**values)

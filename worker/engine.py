@@ -24,6 +24,7 @@ from schemas.artifacts import MAP_FILE, REPORT_FILE, Stage, drive_of_scene
 from schemas.findings import Finding, as_json, error, warning
 from worker.child_protocol import ChildError, ChildRequest, ChildResult, SubmapPlan, Work
 from worker.engine_settings import engine_config
+from worker.file_client import FilesOnDemand
 from worker.progress_pipe import ProgressWriter
 
 CANCEL_INTERVAL_S = 0.2
@@ -83,6 +84,7 @@ def _plan(
         progress=progress,
         cancel=cancelled,
         content_sha256=request.content_sha256,
+        bring=_bring(request),
     )
     unfinished = [(s.number, s.first_unit, s.last_unit) for s in submaps if not s.is_finished]
     return SubmapPlan(total=len(submaps), unfinished=unfinished) if len(unfinished) >= _AT_ONE_TIME else None
@@ -99,6 +101,7 @@ def _map_submap(
         progress=progress,
         cancel=cancelled,
         content_sha256=request.content_sha256,
+        bring=_bring(request),
     )
     return {"stages": [{"stage": stage["stage"], "reused": stage["reused"]} for stage in report["stages"]]}
 
@@ -113,6 +116,7 @@ def _reconstruct(
         progress=progress,
         cancel=cancelled,
         content_sha256=request.content_sha256,
+        bring=_bring(request),
     )
     return _written_report(request.out)
 
@@ -190,12 +194,17 @@ def _drive_of(request: ChildRequest) -> Path:
     return request.drive
 
 
+def _bring(request: ChildRequest) -> FilesOnDemand | None:
+    """Asks for the drive's files where they do not lie in its folder."""
+    return None if request.files is None else FilesOnDemand(request.files)
+
+
 def _preflight(
     request: ChildRequest, config: EngineConfig, progress: ProgressWriter, cancelled: Callable[[], bool]
 ) -> dict[str, Any]:
     """The findings of a reconstruction's first seconds: manifest, files, images, and the calibration's direction."""
     run = stages.Run(
-        read_drive(_drive_of(request)),
+        read_drive(_drive_of(request), bring=_bring(request)),
         config,
         stages.store_of(request.out),
         progress,

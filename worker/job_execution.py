@@ -6,8 +6,9 @@ import logging
 import os
 import socket
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, closing, nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -32,8 +33,9 @@ from service.storage.process_folder import process_folder, sweep
 from service.storage.transfers import STORES, at_one_time
 from worker.attempt import AttemptFolder, run_attempt
 from worker.checkpoints import CheckpointKeeper
-from worker.child_protocol import SubmapPlan, Work
+from worker.child_protocol import FileAddress, SubmapPlan, Work
 from worker.commit_with_retry import commit_with_retry
+from worker.file_server import FileServer
 from worker.heartbeat import Heartbeat
 from worker.job_handlers import ReconstructionHandler, handler_of
 from worker.oom import MemoryKills, kills_since, memory_kills
@@ -208,13 +210,29 @@ class _Execution:
                 retryable=False,
                 stage=Stage.FETCH,
             )
-        with self._finished_stages(folder) as keeper:
+        with self._finished_stages(folder) as keeper, self._served() as address:
             outcome = run_attempt(
-                attempt, scratch=folder.root, check_stop=check_stop, meter=self._meter, settings=self._settings
+                replace(attempt, files=address),
+                scratch=folder.root,
+                check_stop=check_stop,
+                meter=self._meter,
+                settings=self._settings,
             )
             if keeper is not None and self._leaves_stages(outcome):
                 self._retry(lambda: watched(keeper.keep_all, check_stop))
+        if (files := self._handler.files) is not None:
+            files.raise_error()  # what lacks a file is done again, also where it came to its end
         return outcome
+
+    @contextmanager
+    def _served(self) -> Iterator[FileAddress | None]:
+        """Bring files of a large drive as the child asks for them; where it does so."""
+        files = self._handler.files
+        if files is None:
+            yield None
+            return
+        with files, FileServer(files) as server:
+            yield server.address
 
     def _leaves_stages(self, outcome: Outcome) -> bool:
         """Return whether finished stages are all that the attempt was for: then none may be missing."""

@@ -21,12 +21,13 @@ from service.database.connections import Database
 from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
-from service.domain.drive_checkout import materialise
+from service.domain.drive_checkout import check_out
 from service.domain.map_inputs import MapInputs, inputs_of
 from service.job_queue import QUEUES
 from service.settings import Settings
 from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
+from service.storage.on_demand import OnDemandFolder
 from service.storage.transfers import fetch_each
 from worker.attempt import AttemptFolder
 from worker.child_protocol import Attempt, SubmapPlan, Work
@@ -37,9 +38,10 @@ class PreflightHandler:
     """The check of a drive."""
 
     shelf: Shelf | None = None  # it shares no stages
+    files: OnDemandFolder | None = None  # of a drive, where not all that are needed were laid out
 
-    def __init__(self, database: Database, held: jobs.Claim) -> None:
-        self._database, self._held = database, held
+    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
+        self._database, self._held, self._settings = database, held, settings
         self._drive_id = held.drive_id or ""
 
     def is_wanted(self, name: str) -> bool:
@@ -47,7 +49,7 @@ class PreflightHandler:
         return True
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
-        """The drive as a folder.
+        """The drive as a folder; of one that is too large for this disk the manifest.
 
         Raises
         ------
@@ -64,10 +66,19 @@ class PreflightHandler:
         *,
         units: range | None = None,
     ) -> Attempt:
-        drive = folder.root / "drive"
-        contents = materialise(self._database, self._drive_id, drive, fetch=fetch, progress=progress, units=units)
-        work, settings = Work(self._held.kind.lower()), self._held.settings
-        return Attempt(work=work, drive=drive, content_sha256=contents, settings=settings)
+        drive = check_out(self._database, self._drive_id, folder.root / "drive", fetch=fetch, units=units)
+        room_bytes = self._settings.drive_room_bytes
+        # In a folder the files exist once, however many drives are laid out.
+        if drive.size_bytes <= room_bytes or self._settings.stores_in_folder:
+            drive.bring_all(fetch, progress)
+        else:
+            self.files = drive.on_demand(fetch, room_bytes=room_bytes)
+        return Attempt(
+            work=Work(self._held.kind.lower()),
+            drive=drive.folder,
+            content_sha256=drive.content_sha256,
+            settings=self._held.settings,
+        )
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
@@ -81,8 +92,8 @@ class PreflightHandler:
 class _StagesHandler(PreflightHandler):
     """A job whose finished stages lie on the shelf of its drive under its settings."""
 
-    def __init__(self, database: Database, held: jobs.Claim) -> None:
-        super().__init__(database, held)
+    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
+        super().__init__(database, held, settings)
         self._stages = DriveShelf(self._drive_id, settings_sha256(held.settings))
         self.shelf = self._stages
 
@@ -101,10 +112,6 @@ class _StagesHandler(PreflightHandler):
 
 class ReconstructionHandler(_StagesHandler):
     """The reconstruction of a drive: at first its plan, where the drive may be cut into sub-maps."""
-
-    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
-        super().__init__(database, held)
-        self._settings = settings
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
         """The drive as a folder, likewise."""
@@ -173,6 +180,8 @@ class SubmapHandler(_StagesHandler):
 class AggregationHandler:
     """An aggregation."""
 
+    files: OnDemandFolder | None = None
+
     def __init__(self, database: Database, held: jobs.Claim) -> None:
         self._database, self._held = database, held
 
@@ -236,6 +245,7 @@ class ExportHandler:
     """An export of a scene or a version of a map."""
 
     shelf: Shelf | None = None  # it shares no stages
+    files: OnDemandFolder | None = None
 
     def __init__(self, database: Database, held: jobs.Claim) -> None:
         self._database, self._held = database, held
@@ -262,7 +272,8 @@ class ExportHandler:
         folders: dict[str, Path] = {}
         for drive_id in sorted(set(drives.values())):
             folders[drive_id] = folder.root / "drives" / drive_id
-            materialise(self._database, drive_id, folders[drive_id], fetch=fetch, progress=progress)
+            # All of it: most of these images are part of the export, which lies on this disk too.
+            check_out(self._database, drive_id, folders[drive_id], fetch=fetch).bring_all(fetch, progress)
         return Attempt(
             work=Work.EXPORT,
             settings=self._held.settings,
@@ -297,11 +308,11 @@ def handler_of(database: Database, held: jobs.Claim, settings: Settings) -> JobH
         case JobKind.RECONSTRUCTION:
             return ReconstructionHandler(database, held, settings)
         case JobKind.SUBMAP:
-            return SubmapHandler(database, held)
+            return SubmapHandler(database, held, settings)
         case JobKind.EXPORT:
             return ExportHandler(database, held)
         case _:
-            return PreflightHandler(database, held)
+            return PreflightHandler(database, held, settings)
 
 
 def _expires_us(days: float | None) -> int | None:

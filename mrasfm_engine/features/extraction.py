@@ -107,7 +107,7 @@ class ImageMasks:
         outside = self.outside_own_car[image.camera] if self.outside_own_car else None
         made_mask = None
         if image.mask is not None:
-            mask = read_mask(self.drive.root / image.mask, given)
+            mask = read_mask(self.drive.path_of(image.mask), given)
             if mask.shape != rgb.shape[:2]:
                 raise InputError(
                     f"mask {image.mask} has {mask.shape[1]}x{mask.shape[0]} pixels, its image has "
@@ -199,7 +199,7 @@ def features_by_image(
         if known is not None and file in known:
             return known[file]
         try:
-            rgb = read_image_rgb(drive.root / file)
+            rgb = read_image_rgb(drive.path_of(file))
         except IncompleteImageError as problem:
             return problem.reason
         masked = masks.of_image(index, rgb)

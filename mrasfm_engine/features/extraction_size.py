@@ -155,7 +155,7 @@ def _counts(
         if cancel is not None and cancel():
             raise CancelledError
         try:
-            rgb = read_image_rgb(masks.drive.root / masks.drive.images[index].file)
+            rgb = read_image_rgb(masks.drive.path_of(masks.drive.images[index].file))
             return extractor.count(rgb, masks.of_image(index, rgb).usable)
         except InputError:
             return None

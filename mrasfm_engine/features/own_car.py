@@ -127,7 +127,7 @@ def find_own_cars(drive: Drive, *, threads: int, cancel: Cancel | None = None) -
         camera = drive.cameras[image.camera]
         width_px = small_width_px(camera.width, camera.height)
         try:
-            small = read_image_small(drive.root / image.file, (camera.width, camera.height), width_px)
+            small = read_image_small(drive.path_of(image.file), (camera.width, camera.height), width_px)
         except IncompleteImageError:
             return None
         return None if small is None else (small, _outlines(small))

@@ -11,38 +11,20 @@ from pathlib import Path
 
 from mrasfm_engine.scene.drive import Drive, DriveImage
 
+SameContents = Callable[[str, str], bool]  # of two files by name
+
 
 def repeated_images(drive: Drive, content_sha256: Mapping[str, str]) -> frozenset[str]:
     """Files of images with the contents of the image before them of their camera, by the SHA-256 of all files."""
     return frozenset(
         image.file
-        for run in _runs(drive.images, lambda a, b: content_sha256[a] == content_sha256[b])
+        for run in runs_of_same_images(drive.images, comparison_of_contents(drive, content_sha256))
         for image in run[1:]
     )
 
 
-def runs_of_same_images(root: Path, images: Sequence[DriveImage]) -> list[list[DriveImage]]:
-    """Images of each camera that follow one another and have the same contents, two or more of them.
-
-    Parameters
-    ----------
-    root
-        Folder that their files are in.
-    images
-        In their order in time. Files that cannot be read are no copies.
-    """
-    return _runs(images, lambda a, b: have_same_contents(root / a, root / b))
-
-
-def have_same_contents(file: Path, other: Path) -> bool:
-    """Return whether two files have the same bytes; by their sizes most differ already."""
-    try:
-        return filecmp.cmp(file, other, shallow=False)
-    except OSError:  # whoever reads their pixels names it
-        return False
-
-
-def _runs(images: Sequence[DriveImage], are_same: Callable[[str, str], bool]) -> list[list[DriveImage]]:
+def runs_of_same_images(images: Sequence[DriveImage], are_same: SameContents) -> list[list[DriveImage]]:
+    """Images of each camera, in their order in time, that follow one another and are the same, two or more of them."""
     last: dict[int, list[DriveImage]] = {}  # by camera, the run that its next image may belong to
     runs = []
     for image in images:
@@ -52,3 +34,21 @@ def _runs(images: Sequence[DriveImage], are_same: Callable[[str, str], bool]) ->
             runs.append(run)
         run.append(image)
     return [run for run in runs if len(run) > 1]
+
+
+def comparison_of_contents(drive: Drive, content_sha256: Mapping[str, str] | None) -> SameContents:
+    """Tell whether two files are the same, by the SHA-256 of all where it is known, else by reading both.
+
+    Files that cannot be read are no copies.
+    """
+    if content_sha256 is not None:
+        return lambda a, b: content_sha256[a] == content_sha256[b]
+    return lambda a, b: _have_same_contents(drive.path_of(a), drive.path_of(b))
+
+
+def _have_same_contents(file: Path, other: Path) -> bool:
+    """Return whether two files have the same bytes; by their sizes most differ already."""
+    try:
+        return filecmp.cmp(file, other, shallow=False)
+    except OSError:  # whoever reads their pixels names it
+        return False

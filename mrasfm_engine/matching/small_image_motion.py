@@ -44,7 +44,7 @@ def small_images(drive: Drive, images: Sequence[DriveImage]) -> dict[int, Floats
         camera = drive.cameras[image.camera]
         try:
             size_px, width_px = (camera.width, camera.height), max(camera.width // REDUCED, 1)
-            grey = read_image_small(drive.root / image.file, size_px, width_px, colours="GRAY")
+            grey = read_image_small(drive.path_of(image.file), size_px, width_px, colours="GRAY")
         except InputError:
             return {}
         if grey is None:

@@ -94,7 +94,7 @@ def find_standing(
         return small_images(drive, [image for image in of_unit[wanted[place]] if image.file not in repeated])
 
     def are_whole(units: Ints) -> bool:
-        return all(is_whole(drive.root / image.file) for unit in units for image in of_unit[unit])
+        return all(is_whole(drive.path_of(image.file)) for unit in units for image in of_unit[unit])
 
     last = _LastMoved(moves, _PriorWay.from_prior(drive, prior), min_motion_px)
     stands, moved_px = np.zeros(len(moves), dtype=np.bool_), np.full(len(moves), np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.heights import ellipsoidal_heights
@@ -31,7 +31,13 @@ class UnsoundDriveError(InputError):
         self.findings = tuple(findings)
 
 
-def check_drive(drive: Drive, *, use_gnss: bool = True, progress: CountProgress | None = None) -> list[Finding]:
+def check_drive(
+    drive: Drive,
+    *,
+    use_gnss: bool = True,
+    progress: CountProgress | None = None,
+    content_sha256: Mapping[str, str] | None = None,
+) -> list[Finding]:
     """List the errors and oddities of a drive, from its manifest and its files' headers.
 
     Parameters
@@ -40,6 +46,8 @@ def check_drive(drive: Drive, *, use_gnss: bool = True, progress: CountProgress 
         The reconstruction will use the drive's GNSS.
     progress
         Called with how many of how many files are checked.
+    content_sha256
+        SHA-256 of the drive's files by name, where it is known.
 
     Returns
     -------
@@ -47,7 +55,7 @@ def check_drive(drive: Drive, *, use_gnss: bool = True, progress: CountProgress 
         Errors first. With any error the drive cannot be reconstructed.
     """
     found = check_manifest_here(drive.manifest, use_gnss=use_gnss)
-    return errors_first([*found, *check_images(drive, progress)])
+    return errors_first([*found, *check_images(drive, progress, content_sha256=content_sha256)])
 
 
 def check_manifest_here(manifest: DriveManifest, *, use_gnss: bool = True) -> list[Finding]:

@@ -12,6 +12,7 @@ from mrasfm_engine.io.documents import read_parsed
 from mrasfm_engine.io.images import read_image_gray, read_image_rgb, read_mask
 from mrasfm_engine.preflight.drive_check import check_drive, require_sound
 from mrasfm_engine.scene.drive import Drive
+from mrasfm_engine.types import BringFile
 from schemas import DriveManifest, parse_manifest, parse_new_manifest
 from schemas.file_names import MANIFEST_NAME, is_beside_manifest, is_ignored
 from schemas.findings import Finding, Severity
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 
-def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
+def read_drive(folder: Path, *, is_new: bool = False, bring: BringFile | None = None) -> Drive:
     """Load a drive and convert it to the engine's axes (x forward, y left, z up).
 
     Only the manifest is read; `check_drive` looks at the files.
@@ -40,6 +41,8 @@ def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
     ----------
     is_new
         Whether rules hold that came after drives had been accepted: for folders of users, and not for stored drives.
+    bring
+        For a folder that has the manifest alone: puts there whatever else is read, see `Drive.path_of`.
 
     Raises
     ------
@@ -57,7 +60,7 @@ def read_drive(folder: Path, *, is_new: bool = False) -> Drive:
             code="no-manifest",
         )
     manifest = read_manifest(folder / MANIFEST_NAME, is_new=is_new)
-    return Drive(root=folder.resolve(), manifest=manifest_in_flu(manifest))
+    return Drive(root=folder.resolve(), manifest=manifest_in_flu(manifest), bring=bring)
 
 
 def foreign_file(folder: Path) -> Path | None:

@@ -8,7 +8,7 @@ concerns a good part of it, and not the single image.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
@@ -22,7 +22,7 @@ from mrasfm_engine.geometry.geodesy import ecef_from_local, local_from_geodetic
 from mrasfm_engine.io.image_decoding import IncompleteImageError
 from mrasfm_engine.io.images import read_image_gray, read_largest_of_16_bits, unused_bits
 from mrasfm_engine.io.left_out_images import sample_findings
-from mrasfm_engine.io.repeated_images import have_same_contents
+from mrasfm_engine.io.repeated_images import comparison_of_contents
 from mrasfm_engine.preflight.drive_check import check_drive, is_sound
 from mrasfm_engine.scene.drive import Drive, DriveImage, LeftOut
 from mrasfm_engine.types import Bytes, CountProgress, Floats, Floats32
@@ -68,6 +68,7 @@ def inspect_drive(
     use_gnss: bool = True,
     progress: CountProgress | None = None,
     cancel: Callable[[], bool] = lambda: False,
+    content_sha256: Mapping[str, str] | None = None,
 ) -> list[Finding]:
     """Everything that can be said about a drive in seconds: `check_drive`, and if that finds no error, the images.
 
@@ -75,13 +76,15 @@ def inspect_drive(
     ----------
     progress
         Called with how many of how many files are checked.
+    content_sha256
+        SHA-256 of the drive's files by name, where it is known.
 
     Raises
     ------
     CancelledError
         Where `cancel` answered True.
     """
-    findings = check_drive(drive, use_gnss=use_gnss, progress=progress)
+    findings = check_drive(drive, use_gnss=use_gnss, progress=progress, content_sha256=content_sha256)
     if is_sound(findings):
         findings += check_content(drive, use_gnss=use_gnss, cancel=cancel)
     return sorted(findings, key=lambda finding: finding.severity is not Severity.ERROR)
@@ -189,12 +192,13 @@ def _sampled_besides(drive: Drive, taken: set[int]) -> set[int]:
 
 def _look(drive: Drive, image: DriveImage) -> _Look | LeftOut | Finding:
     try:
-        pixels = read_image_gray(drive.root / image.file)
-        largest = read_largest_of_16_bits(drive.root / image.file)
+        path = drive.path_of(image.file)
+        pixels = read_image_gray(path)
+        largest = read_largest_of_16_bits(path)
     except IncompleteImageError as problem:
         return problem.reason
     except InputError as problem:
-        return error(problem.code, problem.what.replace(str(drive.root / image.file), image.file), problem.remedy)
+        return error(problem.code, problem.what.replace(str(path), image.file), problem.remedy)
     gray = _reduced(pixels, SIDE_PX)
     detail, coarse_detail = (
         _variance(cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), sigma_px), cv2.CV_32F))
@@ -294,7 +298,8 @@ def _is_blurred_camera(camera: int, detail: dict[int, float], fineness: dict[int
 def _check_movement(drive: Drive, pairs: Sequence[tuple[_Look, _Look]], use_gnss: bool) -> list[Finding]:
     still: dict[tuple[int, int], list[bool]] = {}  # by the two units: of every camera with enough contrast
     # An image that is another once more says nothing of the vehicle.
-    telling = [(a, b) for a, b in pairs if not have_same_contents(drive.root / a.image.file, drive.root / b.image.file)]
+    are_same = comparison_of_contents(drive, None)  # of a few
+    telling = [(a, b) for a, b in pairs if not are_same(a.image.file, b.image.file)]
     for a, b in telling or pairs:
         verdict = _is_still(a.small, b.small)
         if verdict is not None:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.io.image_header import ImageHeader, ImageKind, read_header
 from mrasfm_engine.io.images import check_image_header, check_mask_header, read_mask
-from mrasfm_engine.io.repeated_images import runs_of_same_images
+from mrasfm_engine.io.repeated_images import comparison_of_contents, runs_of_same_images
 from mrasfm_engine.scene.drive import Drive, DriveImage
 from mrasfm_engine.types import CountProgress
 from schemas.findings import Finding, Severity, error, listed, warning
@@ -29,11 +29,15 @@ _GROUPED = {
 }
 
 
-def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Finding]:
+def check_images(
+    drive: Drive, progress: CountProgress | None = None, *, content_sha256: Mapping[str, str] | None = None
+) -> list[Finding]:
     """Findings about all files that the manifest lists, and about images that it does not.
 
     Parameters
     ----------
+    content_sha256
+        SHA-256 of the drive's files by name, where it is known.
     progress
         Called with how many of how many images are checked.
     """
@@ -63,7 +67,7 @@ def check_images(drive: Drive, progress: CountProgress | None = None) -> list[Fi
         if oddities[code]:
             files = oddities[code]
             findings.append(warning(code, f"{len(files)} images {state}: {listed(files)}", remedy))
-    return [*_gather(findings), *_repeated(drive, sound), *_unlisted(drive)]
+    return [*_gather(findings), *_repeated(drive, sound, content_sha256), *_unlisted(drive)]
 
 
 class _PathCheck:
@@ -91,9 +95,11 @@ class _PathCheck:
             return False
 
 
-def _repeated(drive: Drive, images: Sequence[DriveImage]) -> Iterator[Finding]:
+def _repeated(
+    drive: Drive, images: Sequence[DriveImage], content_sha256: Mapping[str, str] | None
+) -> Iterator[Finding]:
     """One finding of every camera with images that are those before them."""
-    runs = runs_of_same_images(drive.root, images)
+    runs = runs_of_same_images(images, comparison_of_contents(drive, content_sha256))
     for camera, given in enumerate(drive.cameras):
         copies = [run[1:] for run in runs if run[0].camera == camera]
         if not copies:
@@ -111,7 +117,7 @@ def _repeated(drive: Drive, images: Sequence[DriveImage]) -> Iterator[Finding]:
 
 def _check_image(drive: Drive, image: DriveImage, paths: _PathCheck) -> tuple[list[Finding], list[str]]:
     """Findings, and codes of oddities that are reported once for all images."""
-    path, camera = drive.root / image.file, drive.cameras[image.camera]
+    path, camera = drive.path_of(image.file), drive.cameras[image.camera]
     try:
         paths.check(path, image.file)
         header = read_header(path)
@@ -154,7 +160,7 @@ def _oddities(header: ImageHeader) -> list[str]:
 
 def _check_mask(drive: Drive, image: DriveImage, paths: _PathCheck) -> list[Finding]:
     assert image.mask is not None
-    path, camera = drive.root / image.mask, drive.cameras[image.camera]
+    path, camera = drive.path_of(image.mask), drive.cameras[image.camera]
     try:
         paths.check(path, image.mask)
         header = read_header(path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.types import Bools, Floats, Ints
-from schemas import Camera, DriveManifest, Pose
+from mrasfm_engine.types import Bools, BringFile, Floats, Ints
+from schemas import Camera, DriveManifest, Frame, Pose
 
 
 def matrix_from_pose(pose: Pose) -> Floats:
@@ -65,6 +65,21 @@ class Drive:
 
     root: Path
     manifest: DriveManifest
+    bring: BringFile | None = field(default=None, compare=False, repr=False)  # None: all files are in the folder
+
+    def path_of(self, file: str) -> Path:
+        """Path of an image or mask by its name in the manifest; read it at once.
+
+        A drive may be larger than the disk: then the file comes now, and goes when others take its place.
+
+        Raises
+        ------
+        StorageError
+            Where it does not come.
+        """
+        if self.bring is not None:
+            self.bring(file)
+        return self.root / file
 
     @property
     def cameras(self) -> list[Camera]:
@@ -74,7 +89,14 @@ class Drive:
     def restricted_to(self, units: Bools) -> Drive:
         """The drive of some of its units (units,) alone."""
         frames = [frame for frame, is_wanted in zip(self.manifest.frames, units.tolist(), strict=True) if is_wanted]
-        return Drive(self.root, self.manifest.model_copy(update={"frames": frames}))
+        return self._with_frames(frames)
+
+    def part(self, units: range) -> Drive:
+        """The drive of units that follow one another alone."""
+        return self._with_frames(self.manifest.frames[units.start : units.stop])
+
+    def _with_frames(self, frames: list[Frame]) -> Drive:
+        return replace(self, manifest=self.manifest.model_copy(update={"frames": frames}))
 
     @cached_property
     def images(self) -> list[DriveImage]:

@@ -5,7 +5,7 @@ Each takes its input, leaves its result and a report in the store, and is skippe
 
 from __future__ import annotations
 
-from mrasfm_engine.stages._begin import load_models, preflight, prior, probe
+from mrasfm_engine.stages._begin import keep_preflight, load_models, preflight, prior, probe
 from mrasfm_engine.stages._cut import count_of_submaps, cut_drive, is_cut
 from mrasfm_engine.stages._extraction_size import extraction_sizes
 from mrasfm_engine.stages._features import features, store_features
@@ -31,6 +31,7 @@ __all__ = [
     "features",
     "in_units",
     "is_cut",
+    "keep_preflight",
     "leave_out_standing",
     "load_models",
     "mapped",

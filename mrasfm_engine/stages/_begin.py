@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from mrasfm_engine import __version__
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.features.extraction import extract_features
 from mrasfm_engine.geometry.gnss_track import GnssTrack
+from mrasfm_engine.io.stage_store import fingerprint
 from mrasfm_engine.matching.calibration_check import require_calibration_direction
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory, prior_trajectory
 from mrasfm_engine.preflight.drive_check import require_sound
 from mrasfm_engine.preflight.image_content import inspect_drive
-from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.stages._run import Run
 from schemas.artifacts import PLAN_CHECKPOINTS, Stage
 from schemas.findings import Finding, as_json, warning
 
+_CHECK = "preflight"
 PROBE_UNITS = 5
 USUAL_TIMES = 2.0  # the usual time between two positions, that a repeated one lasts
 
@@ -25,15 +29,38 @@ def load_models(run: Run) -> None:
     run.report["models"] = run.components.describe()
 
 
-def preflight(run: Run) -> None:
-    """Check manifest, files and a sample of the images; refuse what cannot work before any long work."""
+def preflight(run: Run) -> list[dict[str, Any]]:
+    """Check manifest, files and a sample of the images; refuse what cannot work before any long work. The findings.
+
+    Where the plan of a long drive has done that, its findings stand.
+    """
     run.begin(Stage.PREFLIGHT)
-    findings = inspect_drive(
-        run.drive, use_gnss=run.config.use_gnss, progress=run.step(Stage.PREFLIGHT), cancel=run.cancel
-    )
-    run.report["findings"] = [as_json(finding) for finding in findings]
-    require_sound(findings)
+    stored = None if run.content_sha256 is None else run.store.load(_CHECK, _check_key(run))
+    if stored is not None:
+        result = list[dict[str, Any]](stored[1]["findings"])
+    else:
+        findings = inspect_drive(
+            run.drive,
+            use_gnss=run.config.use_gnss,
+            progress=run.step(Stage.PREFLIGHT),
+            cancel=run.cancel,
+            content_sha256=run.content_sha256,
+        )
+        result = [as_json(finding) for finding in findings]
+        require_sound(findings)
+    run.report["findings"] = list(result)
     run.progress(Stage.PREFLIGHT, 1, 1)
+    return result
+
+
+def keep_preflight(run: Run, findings: list[dict[str, Any]]) -> None:
+    """Store that the drive is sound, and what was found: the check reads every file of it."""
+    if run.content_sha256 is not None and not run.store.has(_CHECK, _check_key(run)):
+        run.store.save(_CHECK, _check_key(run), {}, {"findings": findings})
+
+
+def _check_key(run: Run) -> str:
+    return fingerprint(run.drive_key, _CHECK, run.config.use_gnss, __version__)
 
 
 def prior(run: Run) -> PriorTrajectory:
@@ -107,10 +134,7 @@ def _probe(run: Run, first_unit: int) -> None:
     """
     units = range(first_unit, min(first_unit + PROBE_UNITS, len(run.drive.manifest.frames)))
     images = [i for i, image in enumerate(run.drive.images) if image.unit in units]
-    probed = Drive(
-        run.drive.root,
-        run.drive.manifest.model_copy(update={"frames": run.drive.manifest.frames[units.start : units.stop]}),
-    )
+    probed = run.drive.part(units)
     features = extract_features(
         probed,
         run.extractor,

@@ -136,12 +136,12 @@ def read_view(scene: Scene, index: int) -> tuple[Bytes, Bools | None]:
 
     The own car counts as masked where it was found. A margin belongs to what moves, as masks are not exact.
     """
-    image, root, made = scene.drive.images[index], scene.drive.root, scene.features[index].made_mask
+    image, made = scene.drive.images[index], scene.features[index].made_mask
     own_car = scene.own_cars[image.camera]
-    rgb = read_image_rgb(root / image.file)
+    rgb = read_image_rgb(scene.drive.path_of(image.file))
     label_map = scene.drive.manifest.label_map
     if image.mask is not None:
-        mask = read_mask(root / image.mask, label_map)
+        mask = read_mask(scene.drive.path_of(image.mask), label_map)
     elif made is not None:
         mask = mask_of_png(made)
     elif own_car is None:

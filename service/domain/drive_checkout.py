@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Container
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from sqlalchemy import select
@@ -12,6 +13,7 @@ from schemas.file_names import MANIFEST_NAME
 from service.database.connections import Database
 from service.database.tables import Blob, Drive, DriveFile
 from service.storage.artifacts import Fetch
+from service.storage.on_demand import OnDemandFolder, RemoteFile
 from service.storage.transfers import fetch_each
 
 
@@ -19,30 +21,55 @@ class DriveGoneError(Exception):
     """The drive was deleted."""
 
 
-def materialise(
-    database: Database,
-    drive_id: str,
-    folder: Path,
-    *,
-    fetch: Fetch,
-    progress: Callable[[int, int], None] = lambda done, total: None,
-    units: range | None = None,
-) -> dict[str, str]:
-    """Lay a drive out as a folder that the engine reads: `drive.json` and the files under the names it gives them.
+@dataclass(frozen=True, kw_only=True)
+class DriveCheckout:
+    """A drive's folder with its manifest, and the files that belong into it.
+
+    Attributes
+    ----------
+    folder
+        Holds `drive.json`.
+    files
+        Images and masks under the names that the manifest gives them, in its order.
+    content_sha256
+        SHA-256 of all the drive's files by name, also of those that are not needed.
+    """
+
+    folder: Path
+    files: dict[str, RemoteFile]
+    content_sha256: dict[str, str]
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of all the files."""
+        return sum(file.size_bytes for file in self.files.values())
+
+    def bring_all(self, fetch: Fetch, progress: Callable[[int, int], None] = lambda done, total: None) -> None:
+        """Lay the drive out as a folder that the engine reads; `progress(done, total)` is called with each file.
+
+        Raises
+        ------
+        Exception
+            What `fetch` raises.
+        """
+        fetch_each(fetch, [(file.key, self.folder / name) for name, file in self.files.items()], progress=progress)
+
+    def on_demand(self, fetch: Fetch, *, room_bytes: int) -> OnDemandFolder:
+        """The files as they are asked for: a part of them at one time."""
+        return OnDemandFolder(self.folder, self.files, fetch=fetch, room_bytes=room_bytes)
+
+
+def check_out(
+    database: Database, drive_id: str, folder: Path, *, fetch: Fetch, units: range | None = None
+) -> DriveCheckout:
+    """Begin a folder for a drive: its manifest comes, and it is known which files belong there.
 
     Parameters
     ----------
     fetch
         Brings one file, in any thread.
-    progress
-        Called as progress(done, total) with each file.
     units
-        Indices of the frames whose files are brought; by default all are.
-
-    Returns
-    -------
-    dict
-        SHA-256 of all the drive's files by their names in the manifest.
+        Indices of the frames whose files are needed; by default all are.
 
     Raises
     ------
@@ -55,19 +82,24 @@ def materialise(
         )
         if manifest is None:
             raise DriveGoneError(drive_id)
-        stored = select(DriveFile.path, Blob.key, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
-        files = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
+        stored = select(DriveFile.path, Blob.key, Blob.size_bytes, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
+        rows = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
     folder.mkdir(parents=True, mode=0o700)
     fetch(manifest.key, folder / MANIFEST_NAME)
-    wanted = None if units is None else _files_of_units(folder / MANIFEST_NAME, units)
-    brought = [(path, key) for path, key, _ in files if wanted is None or path in wanted]
     # Paths were checked when the manifest came: relative, without '..'.
-    fetch_each(fetch, [(key, folder / path) for path, key in brought], progress=progress)
-    return {path: sha256 for path, _, sha256 in files}
+    files = {path: RemoteFile(key, size_bytes) for path, key, size_bytes, _ in rows}
+    wanted = _files_of_units(folder / MANIFEST_NAME, units)
+    return DriveCheckout(
+        folder=folder,
+        files={name: files[name] for name in wanted if name in files},
+        content_sha256={path: sha256 for path, _, _, sha256 in rows},
+    )
 
 
-def _files_of_units(manifest: Path, units: range) -> Container[str]:
-    """Images and masks of some frames. The manifest was checked when it came."""
-    frames = json.loads(manifest.read_bytes())["frames"][units.start : units.stop]
+def _files_of_units(manifest: Path, units: range | None) -> dict[str, None]:
+    """Images and masks of some frames, or all, each once, in their order. The manifest was checked when it came."""
+    frames = json.loads(manifest.read_bytes())["frames"]
+    frames = frames if units is None else frames[units.start : units.stop]
     images = [image for frame in frames for image in frame["images"].values()]
-    return {name for image in images for name in (image["file"], image.get("mask")) if name is not None}
+    names = [name for image in images for name in (image["file"], image.get("mask")) if name is not None]
+    return dict.fromkeys(names)

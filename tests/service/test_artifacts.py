@@ -7,8 +7,6 @@ import errno
 import hashlib
 import os
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -17,7 +15,6 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-import boto3
 import obstore
 import pytest
 from obstore.exceptions import BaseError
@@ -26,7 +23,8 @@ from service.settings import Settings
 from service.storage import artifacts
 from service.storage.artifacts import ArtifactStore
 from service.storage.transfers import fetch_each
-from tests.helpers.live_api import HOST, free_port, settings_of, wait_until
+from tests.helpers.live_api import HOST, free_port, settings_of
+from tests.helpers.s3_server import s3_server, settings_of_bucket
 from worker.retry import retry
 
 CONTENT = os.urandom(3_000_000)
@@ -36,24 +34,8 @@ KEY = f"blobs/prj_1/{SHA256[:2]}/{SHA256}-0001"
 
 @pytest.fixture(scope="session")
 def s3_endpoint() -> Iterator[str]:
-    """An S3 server on loopback."""
-    port = free_port()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "moto.server", "-H", HOST, "-p", str(port)],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-
-    def listens() -> bool:
-        with socket.socket() as probe:
-            return probe.connect_ex((HOST, port)) == 0
-
-    try:
-        wait_until(listens, "the S3 server's start")
-        yield f"http://{HOST}:{port}"
-    finally:
-        process.kill()
-        process.wait()
+    with s3_server() as url:
+        yield url
 
 
 @pytest.fixture(params=["folder", "s3"])
@@ -61,11 +43,7 @@ def store_settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: 
     if request.param == "folder":
         return settings_of(tmp_path / "data")
     endpoint = request.getfixturevalue("s3_endpoint")
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
-    bucket = tmp_path.name.lower().replace("_", "-")[:60]
-    boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1").create_bucket(Bucket=bucket)
-    return settings_of(tmp_path / "data", artifacts_url=f"s3://{bucket}/prefix", s3_endpoint=endpoint)
+    return settings_of(tmp_path / "data", **settings_of_bucket(endpoint, tmp_path.name, monkeypatch))
 
 
 @pytest.fixture

@@ -36,6 +36,13 @@ def brief_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made_once(tmp_path_factory, "brief-drive", lambda out: render_drives(options, out))
 
 
+@pytest.fixture(scope="session")
+def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rendered drive of 2 cameras that can be cut into three sub-maps. Tests only read it."""
+    options = SynthOptions(cameras=2, units=41, seed=3, width=320, height=180, texture_px=128, rate_hz=5.0)
+    return made_once(tmp_path_factory, "long-drive", lambda out: render_drives(options, out))
+
+
 @pytest.fixture
 def make_world(tmp_path: Path) -> Iterator[Callable[..., World]]:
     """A function that makes an installation with a broker and settings of the test's."""

@@ -13,7 +13,7 @@ from schemas.api.jobs import JobKind
 from service.database.connections import Database
 from service.domain import checkpoints, jobs
 from service.domain.checkpoints import MapShelf
-from service.domain.drive_checkout import materialise
+from service.domain.drive_checkout import check_out
 from service.settings import Settings
 from service.storage.blob_writer import file_sha256, store_file
 from tests.helpers.service_world import World
@@ -64,17 +64,17 @@ def test_a_part_of_a_drive_is_laid_out(tmp_path: Path, brief_drive: Path) -> Non
     world = World(tmp_path / "world")
     drive_id = world.add_drive(brief_drive)
     target, done = tmp_path / "part", list[tuple[int, int]]()
-    digests = materialise(
-        world.database, drive_id, target, fetch=world.artifacts.fetch, units=range(1, 3),
-        progress=lambda *count: done.append(count),
-    )  # fmt: skip
+    fetch = world.artifacts.fetch
+    drive = check_out(world.database, drive_id, target, fetch=fetch, units=range(1, 3))
+    drive.bring_all(fetch, lambda *count: done.append(count))
     manifest = json.loads((brief_drive / "drive.json").read_bytes())
     images = [image for frame in manifest["frames"] for image in frame["images"].values()]
     named = {name for image in images for name in (image["file"], image.get("mask")) if name}
     wanted = [image for frame in manifest["frames"][1:3] for image in frame["images"].values()]
     brought = {path.relative_to(target).as_posix() for path in target.rglob("*") if path.is_file()}
     assert brought == {"drive.json"} | {name for image in wanted for name in (image["file"], image.get("mask")) if name}
-    assert digests.keys() == named
+    assert drive.content_sha256.keys() == named
+    assert drive.size_bytes == sum((target / name).stat().st_size for name in brought - {"drive.json"})
     assert done[-1] == (len(brought) - 1, len(brought) - 1)
     world.close()
 

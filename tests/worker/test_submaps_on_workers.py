@@ -12,8 +12,6 @@ import pytest
 from sqlalchemy import select
 
 from mrasfm_engine.pipeline import reconstruct
-from mrasfm_engine.synthetic.drive_writer import render_drives
-from mrasfm_engine.synthetic.options import SynthOptions
 from schemas.artifacts import SUBMAP_STAGES, checkpoint_file, submap_checkpoint
 from service.database.tables import Blob, Checkpoint, Job, SceneFile, now_us
 from service.domain.jobs import number_of
@@ -23,14 +21,6 @@ from worker.engine_settings import engine_config
 from worker.job_execution import Runner
 
 SUBMAPS = 3
-
-
-@pytest.fixture(scope="session")
-def long_drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A rendered drive of 2 cameras that can be cut into three sub-maps. Tests only read it."""
-    out = tmp_path_factory.mktemp("rendered") / "drive"
-    options = SynthOptions(cameras=2, units=41, seed=3, width=320, height=180, texture_px=128, rate_hz=5.0)
-    return render_drives(options, out)[0]
 
 
 def submaps_of(world: World, job_id: str) -> list[Job]:

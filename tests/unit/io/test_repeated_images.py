@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from mrasfm_engine.io.repeated_images import repeated_images, runs_of_same_images
+from mrasfm_engine.io.repeated_images import comparison_of_contents, repeated_images, runs_of_same_images
 from mrasfm_engine.io.stage_store import content_sha256_of
 from mrasfm_engine.preflight.drive_reader import read_drive
 from mrasfm_engine.scene.drive import Drive
@@ -26,15 +27,24 @@ def drive(drive_document: dict[str, Any], write_drive: Callable[[dict[str, Any]]
 COPIES = ["images/left/000002.png", "images/left/000003.png", "images/right/000004.png"]
 
 
+def copies_of(drive: Drive, content_sha256: Mapping[str, str] | None) -> list[list[str]]:
+    runs = runs_of_same_images(drive.images, comparison_of_contents(drive, content_sha256))
+    return [[image.file for image in run[1:]] for run in runs]
+
+
 def test_they_are_those_of_their_own_camera_before(drive: Drive) -> None:
-    assert repeated_images(drive, content_sha256_of(drive, threads=1)) == set(COPIES)
-    assert [[image.file for image in run[1:]] for run in runs_of_same_images(drive.root, drive.images)] == [
-        COPIES[:2],
-        COPIES[2:],
-    ]
+    known = content_sha256_of(drive, threads=1)
+    assert repeated_images(drive, known) == set(COPIES)
+    assert copies_of(drive, known) == copies_of(drive, None) == [COPIES[:2], COPIES[2:]]
 
 
 def test_a_file_that_is_not_there_is_no_copy(drive: Drive) -> None:
     (drive.root / "images/left/000002.png").unlink()
-    (run,) = runs_of_same_images(drive.root, drive.images)
-    assert [image.file for image in run[1:]] == COPIES[2:]
+    assert copies_of(drive, None) == [COPIES[2:]]
+
+
+def test_files_of_known_contents_are_not_read(drive: Drive) -> None:
+    """Of a drive that is larger than the disk each would have to come."""
+    known = content_sha256_of(drive, threads=1)
+    shutil.rmtree(drive.root)
+    assert copies_of(drive, known) == [COPIES[:2], COPIES[2:]]

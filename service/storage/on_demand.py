@@ -1,0 +1,126 @@
+"""A folder of bounded size, whose files come from the artifact store as they are asked for.
+
+A drive of ten minutes has tens of gigabytes of images, of which a stage reads each once, mostly in the order of the
+path. Others that follow are brought ahead of who asks, as each takes a round trip or several.
+"""
+
+from __future__ import annotations
+
+import contextvars
+import threading
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+from service.storage.artifacts import Fetch
+from service.storage.transfers import FETCHES
+
+_AHEAD = 2 * FETCHES  # files that are brought before they are asked for
+_FEWEST = 4 * _AHEAD  # that stay, whatever their size: one that was asked for is read before so many others come
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """A file in the artifact store."""
+
+    key: str
+    size_bytes: int
+
+
+class OnDemandFolder:
+    """Files of a drive under their names, as many as fit; those that were asked for longest ago go first.
+
+    Parameters
+    ----------
+    folder
+        It need not exist.
+    files
+        All files, by their names relative to the folder, in the order in which most are asked for.
+    fetch
+        Brings one of them, in any thread.
+    room_bytes
+        That the files take at one time, but for some dozens of very large ones.
+    """
+
+    def __init__(self, folder: Path, files: Mapping[str, RemoteFile], *, fetch: Fetch, room_bytes: int) -> None:
+        self._folder, self._remote, self._fetch, self._room_bytes = folder, files, fetch, room_bytes
+        self._order: Sequence[str] = list(files)
+        self._place = {name: place for place, name in enumerate(self._order)}
+        self._last = -1  # place of the file that was asked for last
+        self._files: OrderedDict[str, Future[None]] = OrderedDict()  # those here, or on their way
+        self._bytes = 0
+        self._error: Exception | None = None
+        self._lock = threading.Lock()
+        self._pool = ThreadPoolExecutor(FETCHES, thread_name_prefix="on-demand")
+        for parent in {(folder / name).parent for name in files}:
+            parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+
+    def bring(self, name: str) -> None:
+        """Return when a file is in the folder, where it stays until many others were asked for.
+
+        Raises
+        ------
+        KeyError
+            Where the drive has no such file.
+        Exception
+            What `fetch` raises.
+        """
+        with self._lock:
+            place, last = self._place[name], self._last
+            self._last = place
+            brought = self._begin(name)
+            self._files.move_to_end(name)
+            if abs(place - last) <= _AHEAD:  # who asks goes along the files, and takes no samples
+                for other in self._beside(place):
+                    self._begin(other)
+        brought.result()
+
+    def raise_error(self) -> None:
+        """Raise the first error of a file that did not come, if there was one."""
+        if self._error is not None:
+            raise self._error
+
+    def _beside(self, place: int) -> Iterator[str]:
+        """The next files in both directions, nearest first: those that were passed are here as yet."""
+        for step in range(1, _AHEAD + 1):
+            for other in (place + step, place - step):
+                if 0 <= other < len(self._order):
+                    yield self._order[other]
+
+    def _begin(self, name: str) -> Future[None]:
+        if name not in self._files:
+            self._make_room(self._remote[name].size_bytes)
+            self._bytes += self._remote[name].size_bytes
+            # In the context of who asks: the lines of a log name the job.
+            self._files[name] = self._pool.submit(contextvars.copy_context().run, self._bring, name)
+        return self._files[name]
+
+    def _make_room(self, size_bytes: int) -> None:
+        done = [name for name, future in self._files.items() if future.done()]
+        for name in done[: max(0, len(self._files) - _FEWEST)]:
+            if self._bytes + size_bytes <= self._room_bytes:
+                return
+            self._forget(name)
+            (self._folder / name).unlink(missing_ok=True)
+
+    def _bring(self, name: str) -> None:
+        try:
+            self._fetch(self._remote[name].key, self._folder / name)
+        except Exception as error:
+            with self._lock:
+                self._forget(name)  # it may be asked for again
+                self._error = self._error or error
+            raise
+
+    def _forget(self, name: str) -> None:
+        del self._files[name]
+        self._bytes -= self._remote[name].size_bytes
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
