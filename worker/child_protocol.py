@@ -26,7 +26,7 @@ class Work(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class FileAddress:
-    """Port on the loopback interface at which the supervisor is asked for files, and the word that shows who may ask."""
+    """Port of the loopback interface where the supervisor is asked for files, and the word that shows who may ask."""
 
     port: int
     token: str
