@@ -19,8 +19,8 @@ from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.read_model import ModelImage, read_images, read_points, read_vertices
 from mrasfm_engine.scene.drive import matrix_from_pose
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from schemas import Camera, DriveManifest, Pose
-from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, component_folder, component_scene
+from schemas import Camera, DriveManifest, Gnss, Pose
+from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, REPORT_FILE, component_folder, component_scene
 from schemas.file_names import portable_key
 from schemas.gnss_check import MAX_SPEED_MPS
 
@@ -126,7 +126,7 @@ def read_scene(folder: Path, name: str) -> SourceScene:
         scene = _arrays(
             folder,
             name=name,
-            manifest=_with_refined(folder, manifest, calibration, name),
+            manifest=_with_receiver(folder, _with_refined(folder, manifest, calibration, name), report, name),
             documents=(frame, poses, calibration, report),
             place=place,
         )
@@ -248,6 +248,22 @@ def _with_refined(folder: Path, manifest: DriveManifest, calibration: dict[str, 
     with _damaged(folder / "calibration.json", name):
         cameras = [refined(camera) for camera in manifest.rig.cameras]
     return manifest.model_copy(update={"rig": manifest.rig.model_copy(update={"cameras": cameras})})
+
+
+def _with_receiver(folder: Path, manifest: DriveManifest, report: dict[str, Any], name: str) -> DriveManifest:
+    """The manifest with the receiver's clock and antenna as the scene's adjustment found them."""
+    with _damaged(folder / REPORT_FILE, name):
+        found = [stage["gnss"] for stage in report.get("stages", ()) if "gnss" in stage]
+        if manifest.gnss is None or not found:
+            return manifest
+        gnss = dict(manifest.gnss)
+        if "antenna" in found[-1]:
+            gnss["antenna_in_rig_m"] = found[-1]["antenna"]["in_rig_m"]
+        if "clock_offset_s" in found[-1]:
+            late_us = round(float(found[-1]["clock_offset_s"]) * 1e6)
+            samples = [dict(sample) | {"timestamp_us": sample.timestamp_us + late_us} for sample in gnss["samples"]]
+            gnss["samples"] = [sample for sample in samples if sample["timestamp_us"] >= 0]
+        return manifest.model_copy(update={"gnss": Gnss(**gnss)})
 
 
 def _arrays(

@@ -12,8 +12,9 @@ error jumps, the process begins anew: samples after a jump are later by a time i
 derivatives in the poses are those of e at the best d. Its Gauss-Newton matrix is J'WJ - G M^-1 G' with G = -J'W D,
 M = P + D'WD and D = wander A / sigma: the Schur complement of d, which `Extra.add_auxiliary` takes as G and M.
 
-A clock that is off moves all positions along the way, by speed times its offset. Where it may be, the offset is one
-more state, in standard deviations of what is known of it: D has a column c = velocity sigma_clock / sigma, P a one.
+A clock that is off moves all positions along the way, by speed times its offset; an antenna that is elsewhere on the
+vehicle turns with it. Where one may be, its error is one more state, or three, in standard deviations of what is known
+of it: D has columns C, as velocity sigma_clock / sigma, and P ones.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from mrasfm_engine.bundle_adjustment.priors import (
 )
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
+from mrasfm_engine.geometry.small_cholesky import factorise, solve
 from mrasfm_engine.jit import njit
 from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Floats, Ints
@@ -61,6 +63,7 @@ class ReceiverPositions:
     wander_time_s: float  # correlation time of the wandering part
     segment: Ints | None = None  # (n,) numbers of the parts between which the error jumps; None for one
     clock_m: Floats | None = None  # (n, 3) by which a clock that is ahead by a sigma moves them; None if it is right
+    lever_m: Floats | None = None  # (n, 3, 3) likewise by an antenna that is off along an axis; None if it is not
     loss_scale: float = 3.0
 
     def bounded(self, largest_m: float) -> tuple[ReceiverPositions, Floats]:
@@ -83,10 +86,11 @@ class ReceiverPositions:
         least_spacing_s: float,
         segment: Ints | None = None,
         clock_m: Floats | None = None,
+        lever_m: Floats | None = None,
     ) -> ReceiverPositions:
         """The term of samples (n,), in the order of time, with knots where they are needed.
 
-        `segment` (n,) numbers the parts between which the error jumps. See the class for `clock_m`.
+        `segment` (n,) numbers the parts between which the error jumps. See the class for `clock_m` and `lever_m`.
 
         Their errors (n, 3) have an independent and a wandering part. Knots are `least_spacing_s` apart, farther on
         drives that would need more than `MAX_KNOTS`. What the process does between two of them counts as an error that
@@ -118,6 +122,7 @@ class ReceiverPositions:
             wander_time_s=wander_time_s,
             segment=segment,
             clock_m=clock_m,
+            lever_m=lever_m,
         )
 
     def of_rows(self, rows: Ints, unit: Ints, share: Floats) -> ReceiverPositions:
@@ -131,6 +136,7 @@ class ReceiverPositions:
             time_s=self.time_s[rows],
             segment=None if self.segment is None else self.segment[rows],
             clock_m=None if self.clock_m is None else self.clock_m[rows],
+            lever_m=None if self.lever_m is None else self.lever_m[rows],
         )
 
     @cached_property
@@ -158,9 +164,20 @@ class ReceiverPositions:
         return self.wander_m / self.sigma_m
 
     @cached_property
-    def _clock(self) -> Floats:
-        """The clock's column c (n, 3); zero where it is right."""
-        return np.zeros_like(self.sigma_m) if self.clock_m is None else self.clock_m / self.sigma_m
+    def common_m(self) -> Floats:
+        """Ways (n, 3, c) in which errors that all positions have in common move them, by a sigma each."""
+        ways = [np.zeros((len(self.unit), AXES, 0))]
+        if self.clock_m is not None:
+            ways.append(self.clock_m[:, :, None])
+        if self.lever_m is not None:
+            ways.append(self.lever_m)
+        return np.ascontiguousarray(np.concatenate(ways, axis=2))
+
+    @cached_property
+    def _common(self) -> Floats:
+        """The columns C (n, 3, c) of these errors."""
+        result: Floats = self.common_m / self.sigma_m[:, :, None]
+        return result
 
     def _by_knots(self, weights: Floats, axis: int) -> Floats:
         """M (2, k) of one axis, as `_precision` has it."""
@@ -181,75 +198,81 @@ class ReceiverPositions:
         np.add.at(result, after, weighted * share[:, None])
         return result
 
-    def _at_samples(self, states: Floats, clock: float) -> Floats:
-        """D d (n, 3) of states (k, 3) and that of the clock."""
+    def _at_samples(self, states: Floats, common: Floats) -> Floats:
+        """D d (n, 3) of states (k, 3) and those of common errors (c,)."""
         before, after, share = self._places
         blend = states[before] + share[:, None] * (states[after] - states[before])
-        result: Floats = self._gain * blend + self._clock * clock
+        result: Floats = self._gain * blend + self._common @ common
         return result
 
     def _whitened(self, state: State) -> tuple[Floats, Floats]:
         return antenna_residuals(state, self.unit, self.lever_arm_m, self.position_m, self.sigma_m)
 
-    def _best(self, whitened: Floats) -> tuple[Floats, float, Floats, Floats]:
-        """The states (k, 3) and that of the clock that cost least, with residuals (n, 3) and robust weights (n,)."""
-        states, clock = np.empty((len(self.knots_s), AXES)), np.zeros(1)
+    def _best(self, whitened: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+        """The states (k, 3) and (c,) that cost least, with residuals (n, 3) and robust weights (n,)."""
+        states, common = np.empty((len(self.knots_s), AXES)), np.zeros(self._common.shape[2])
         residuals, weights = np.empty_like(whitened), np.ones(len(whitened))
         _find_best_states(
-            whitened, self._gain, self._clock, self.clock_m is not None, *self._places, self._precision,
-            self.loss_scale, states, clock, residuals, weights,
+            whitened, self._gain, self._common, *self._places, self._precision, self.loss_scale,
+            states, common, residuals, weights,
         )  # fmt: skip
-        return states, float(clock[0]), residuals, weights
+        return states, common, residuals, weights
 
     def errors_m(self, state: State) -> Floats:
-        """The part (n, 3) of the positions' errors that wanders or is the clock's, as the poses of a state show it."""
-        states, clock, _, _ = self._best(self._whitened(state)[1])
-        result: Floats = -self._at_samples(states, clock) * self.sigma_m
+        """The part (n, 3) of positions' errors that wanders or is common to all, as the poses of a state show it."""
+        states, common, _, _ = self._best(self._whitened(state)[1])
+        result: Floats = -self._at_samples(states, common) * self.sigma_m
         return result
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        states, clock, residuals, _ = self._best(self._whitened(state)[1])
+        states, common, residuals, _ = self._best(self._whitened(state)[1])
         off, diagonal = self._precision
         prior = (diagonal[:, None] * states**2).sum() + 2.0 * (off[1:, None] * states[1:] * states[:-1]).sum()
-        return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior + clock**2)
+        return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior + (common**2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
         arm, whitened = self._whitened(state)
         _, _, r, w = self._best(whitened)
         free, j_w, slots = add_to_units(layout, extra, self.unit, antenna_jacobian(arm, self.sigma_m), r, w)
-        if not (len(free) and (self.wander_m.any() or self.clock_m is not None)):
+        more = self._common.shape[2]
+        if not (len(free) and (self.wander_m.any() or more)):
             return
         count, (before, after, share) = len(self.knots_s), self._places
         with_units = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
         for knot, part in ((before, 1.0 - share), (after, share)):
             np.add.at(with_units, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
         with_process = np.moveaxis(with_units, 1, 3).reshape(-1, AXES * count)
-        with_clock = np.zeros((layout.num_units, UNIT_DOF))
-        np.add.at(with_clock, slots, -(j_w @ self._clock[free, :, None])[..., 0])
-        square = np.eye(AXES * count + 1)
+        with_common = np.zeros((layout.num_units, UNIT_DOF, more))
+        np.add.at(with_common, slots, -(j_w @ self._common[free]))
+        square, last = np.eye(AXES * count + more), slice(AXES * count, AXES * count + more)
         for axis in range(AXES):
             own = slice(axis * count, (axis + 1) * count)
             off, diagonal = self._by_knots(w, axis)
             square[own, own] = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
-            square[own, -1] = square[-1, own] = self._at_knots((w * self._clock[:, axis])[:, None], axis)[:, 0]
-        square[-1, -1] += (w[:, None] * self._clock**2).sum()
-        extra.add_auxiliary(np.column_stack([with_process, with_clock.ravel()]), square)
+            square[own, last] = self._at_knots(w[:, None] * self._common[:, axis], axis)
+            square[last, own] = square[own, last].T
+        square[last, last] += np.einsum("nac,n,nad->cd", self._common, w, self._common)
+        extra.add_auxiliary(
+            np.column_stack([with_process, with_common.reshape(UNIT_DOF * layout.num_units, more)]), square
+        )
 
     def information(self, columns: Floats) -> Floats:
         """Information X' C^-1 X (m, m) on m ways (n, 3, m) in which the antenna may be moved in metres.
 
         C is the covariance of the positions' errors, with all of them at full weight.
         """
-        if self.clock_m is None:
-            return self._information_by_process(columns)
-        known = self._information_by_process(np.concatenate([columns, self.clock_m[:, :, None]], axis=2))
-        result: Floats = known[:-1, :-1] - np.outer(known[:-1, -1], known[-1, :-1]) / (1.0 + known[-1, -1])
+        count = columns.shape[2]
+        known = self._information_by_process(np.concatenate([columns, self.common_m], axis=2))
+        of_common = np.eye(known.shape[0] - count) + known[count:, count:]
+        result: Floats = known[:count, :count] - known[:count, count:] @ np.linalg.solve(
+            of_common, known[count:, :count]
+        )
         return result
 
     def _information_by_process(self, columns: Floats) -> Floats:
-        """The same where the clock is right."""
+        """The same where positions have no error in common."""
         scaled = columns / self.sigma_m[:, :, None]
         result: Floats = np.einsum("nam,nal->ml", scaled, scaled)
         for axis in range(AXES):
@@ -270,8 +293,8 @@ class ReceiverPositions:
         prior = _log_determinant(self._precision)
         for axis in range(AXES):
             determinant += _log_determinant(self._by_knots(np.ones(len(off_m)), axis)) - prior
-        if self.clock_m is not None:
-            determinant += np.log1p(self._information_by_process(self.clock_m[:, :, None])[0, 0])
+        common = self._information_by_process(self.common_m)
+        determinant += np.linalg.slogdet(np.eye(len(common)) + common)[1]
         return -0.5 * (left + float(determinant))
 
     def information_given(self, way: Floats, others: Floats) -> float:
@@ -291,63 +314,76 @@ def time_of_process_s(time_s: Floats, segment: Ints | None, wander_time_s: float
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _find_best_states(
-    whitened: Any, gain: Any, clock_gain: Any, clock_varies: bool, before: Any, after: Any, share: Any, precision: Any,
-    loss_scale: float, states: Any, clock: Any, residuals: Any, weights: Any,
+    whitened: Any, gain: Any, columns: Any, before: Any, after: Any, share: Any, precision: Any, loss_scale: float,
+    states: Any, common: Any, residuals: Any, weights: Any,
 ) -> None:  # fmt: skip
     """Find the states (k, 3), k > 0, by iteratively reweighted least squares, with their residuals and weights.
 
-    M and D'Wv, as `_by_knots` and `_at_knots` have them, are formed and solved without an array in between. The clock's
-    state (1,) is eliminated last: `moved` is what the process makes of its column.
+    M and D'Wv, as `_by_knots` and `_at_knots` have them, are formed and solved without an array in between. The states
+    (c,) of common errors, by their `columns` (n, 3, c), are eliminated last: `moved` is what the process makes of them.
     """
-    count = len(states)
+    count, more = len(states), len(common)
     diagonal, off = np.empty(count), np.empty(count)  # of M, and its superdiagonal, whose first entry is unused
-    moved = np.zeros((count, AXES))
+    moved = np.zeros((more, count, AXES))
+    known, factor_of_known, wanted = np.empty((more, more)), np.zeros((more, more)), np.empty(more)
+    left = np.empty(more)
     for _ in range(MAX_REWEIGHTINGS):
         for axis in range(AXES):
-            diagonal[:], off[:], states[:, axis], moved[:, axis] = precision[1], precision[0], 0.0, 0.0
+            diagonal[:], off[:], states[:, axis], moved[:, :, axis] = precision[1], precision[0], 0.0, 0.0
             for i in range(len(whitened)):
                 a, b, later = before[i], after[i], share[i]
                 own = gain[i, axis]
                 weight, right = weights[i] * own * own, weights[i] * own * whitened[i, axis]
-                by_clock = weights[i] * own * clock_gain[i, axis]
                 diagonal[a] += weight * (1.0 - later) ** 2
                 states[a, axis] += right * (1.0 - later)
-                moved[a, axis] += by_clock * (1.0 - later)
+                for c in range(more):
+                    moved[c, a, axis] += weights[i] * own * columns[i, axis, c] * (1.0 - later)
                 if b > a:
                     diagonal[b] += weight * later**2
                     off[b] += weight * later * (1.0 - later)
                     states[b, axis] += right * later
-                    moved[b, axis] += by_clock * later
+                    for c in range(more):
+                        moved[c, b, axis] += weights[i] * own * columns[i, axis, c] * later
             for k in range(1, count):
                 factor = off[k] / diagonal[k - 1]
                 diagonal[k] -= factor * off[k]
                 states[k, axis] -= factor * states[k - 1, axis]
-                moved[k, axis] -= factor * moved[k - 1, axis]
+                for c in range(more):
+                    moved[c, k, axis] -= factor * moved[c, k - 1, axis]
             states[count - 1, axis] /= diagonal[count - 1]
-            moved[count - 1, axis] /= diagonal[count - 1]
+            for c in range(more):
+                moved[c, count - 1, axis] /= diagonal[count - 1]
             for k in range(count - 2, -1, -1):
                 states[k, axis] = (states[k, axis] - off[k + 1] * states[k + 1, axis]) / diagonal[k]
-                moved[k, axis] = (moved[k, axis] - off[k + 1] * moved[k + 1, axis]) / diagonal[k]
-        if clock_varies:
-            known, wanted = 1.0, 0.0
+                for c in range(more):
+                    moved[c, k, axis] = (moved[c, k, axis] - off[k + 1] * moved[c, k + 1, axis]) / diagonal[k]
+        if more:
+            known[:], wanted[:] = 0.0, 0.0
+            for c in range(more):
+                known[c, c] = 1.0
             for i in range(len(whitened)):
                 a, b, later = before[i], after[i], share[i]
                 for axis in range(AXES):
-                    left = clock_gain[i, axis] - gain[i, axis] * (
-                        moved[a, axis] + later * (moved[b, axis] - moved[a, axis])
-                    )
-                    known += weights[i] * left * clock_gain[i, axis]
-                    wanted += weights[i] * left * whitened[i, axis]
-            clock[0] = wanted / known
-            for k in range(count):
-                for axis in range(AXES):
-                    states[k, axis] -= clock[0] * moved[k, axis]
+                    for c in range(more):
+                        process = moved[c, a, axis] + later * (moved[c, b, axis] - moved[c, a, axis])
+                        left[c] = columns[i, axis, c] - gain[i, axis] * process
+                        wanted[c] += weights[i] * left[c] * whitened[i, axis]
+                        for d in range(c + 1):
+                            known[c, d] += weights[i] * left[c] * columns[i, axis, d]
+            if factorise(known, more, factor_of_known):  # always: its least eigenvalue is 1
+                solve(factor_of_known, wanted, more, common)
+            for c in range(more):
+                for k in range(count):
+                    for axis in range(AXES):
+                        states[k, axis] -= common[c] * moved[c, k, axis]
         change = 0.0
         for i in range(len(whitened)):
             squared = 0.0
             for axis in range(AXES):
                 own = states[before[i], axis] + share[i] * (states[after[i], axis] - states[before[i], axis])
-                residuals[i, axis] = whitened[i, axis] - gain[i, axis] * own - clock_gain[i, axis] * clock[0]
+                residuals[i, axis] = whitened[i, axis] - gain[i, axis] * own
+                for c in range(more):
+                    residuals[i, axis] -= columns[i, axis, c] * common[c]
                 squared += residuals[i, axis] ** 2
             renewed = 1.0 / (1.0 + squared / loss_scale**2)
             change = max(change, abs(renewed - weights[i]))

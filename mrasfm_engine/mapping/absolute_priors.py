@@ -16,10 +16,12 @@ from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.mapping.calibration import scale_of_baselines, scale_with_baselines
 from mrasfm_engine.mapping.clock_leap import ClockLeap, find_clock_leap
 from mrasfm_engine.mapping.georeferencing import SIGMA_PITCH_RAD, SIGMA_ROLL_RAD
+from mrasfm_engine.mapping.lever_arm import LeverArm
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
     factor_by_gnss,
     find_clock,
+    find_lever_arm,
     place_by_gnss,
     positions_of_units,
     reassess_positions,
@@ -30,7 +32,7 @@ from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.types import Bools, Floats, Ints
 
-CLOCK_ROUNDS = 4  # of finding the receiver's clock, as positions show it along tangents of the way
+RECEIVER_ROUNDS = 4  # of finding the receiver's clock and antenna, as positions show them along tangents of the way
 LOCAL_POSITIONS = 40  # measured positions, nearest to the units of a local adjustment, that take part in it
 
 
@@ -63,6 +65,7 @@ class AbsolutePriors:
     rough_fault: str = ""
     placed_by_rough_poses: bool = False
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
+    lever: LeverArm | None = None  # by which the lever arm is another one than was given; None where that is right
     clock_leap: ClockLeap | None = None  # of that clock, behind or before which positions take no part
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
@@ -110,10 +113,10 @@ class AbsolutePriors:
         self._renew_rough(mapper)
 
     def _place_by_gnss(self, mapper: Mapper, *, sigma_scale: float = 0.0, rig_may_be_wrong: bool = False) -> None:
-        """Move the scene to where positions say, by the clock that they show once it is there."""
+        """Move the scene to where positions say, by the clock and the antenna that they show once it is there."""
         if self.gnss is None or self.antenna_in_rig_m is None:
             return
-        rounds = CLOCK_ROUNDS
+        rounds = RECEIVER_ROUNDS
         while rounds:
             self.placement = place_by_gnss(
                 mapper,
@@ -123,11 +126,12 @@ class AbsolutePriors:
                 rig_may_be_wrong=rig_may_be_wrong,
                 thorough=True,
                 clock=self.clock,
+                lever=self.lever,
             )
             leap = self.clock_leap
-            if not self._set_clock(mapper):
+            if not self._set_receiver(mapper):
                 break
-            rounds = rounds - 1 if self.clock_leap is leap else CLOCK_ROUNDS
+            rounds = rounds - 1 if self.clock_leap is leap else RECEIVER_ROUNDS
 
     def _place_by_rough_poses(self, mapper: Mapper) -> None:
         """Move the scene to where rough poses say, if positions do not and if they have its shape."""
@@ -173,7 +177,7 @@ class AbsolutePriors:
         if self.positions is not None:
             self.reassess(mapper, thorough=False)
         elif self.gnss is not None and self.antenna_in_rig_m is not None:
-            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, clock=self.clock)
+            self.placement = place_by_gnss(mapper, self.gnss, self.antenna_in_rig_m, clock=self.clock, lever=self.lever)
         if self.placement is not None and self.placement.is_contradicted:
             self.placement = None
         self._renew_rough(mapper)
@@ -186,22 +190,51 @@ class AbsolutePriors:
             self.placement = reassess_positions(
                 mapper, self.placement, thorough=thorough, clock_varies=self.clock_varies
             )
-            if thorough and self._set_clock(mapper):
+            if thorough and self._set_receiver(mapper):
                 self._place_by_gnss(mapper)
         if self.rough is not None:
             self._renew_rough(mapper)
 
-    def _set_clock(self, mapper: Mapper) -> bool:
-        """Give samples the times that positions show; whether these are others than before."""
-        if self.placement is None or self.placement.prior is None or self.gnss is None or self.clock_varies:
+    def _set_receiver(self, mapper: Mapper) -> bool:
+        """Give samples the times, and the antenna the place, that positions show; whether these are others than before.
+
+        Where an error of either would explain them alone, it is the one that is more probable: what it leaves shows
+        whether there is another.
+        """
+        if self.placement is None or self.placement.prior is None or self.gnss is None:
             return False
-        before, found = self.clock, find_clock(mapper, self.placement)
-        found = found if found is not None and found.is_wrong else None
+        clock = None if self.clock_varies else find_clock(mapper, self.placement)
+        clock = clock if clock is not None and clock.is_wrong else None
+        lever = find_lever_arm(mapper, self.placement, times_vary=self.clock_varies)
+        lever = lever if lever is not None and lever.is_wrong else None
+        if clock is not None and lever is not None and self.clock is None and self.lever is None:
+            clock, lever = (clock, None) if clock.log_odds >= lever.log_odds else (None, lever)
+        is_other = False if self.clock_varies else self._take_clock(clock)
+        is_other |= self._take_lever_arm(lever)
+        return is_other or (clock is not None and self._leave_a_side_of_a_leap(mapper))
+
+    def _take_clock(self, found: ReceiverClock | None) -> bool:
+        """Give samples the times of a clock, None for that of the images; whether these are others than before."""
+        assert self.gnss is not None
+        assert self.placement is not None
+        before = self.clock
         if found is before or (found is not None and before is not None and found.is_as(before)):
-            return found is not None and self._leave_a_side_of_a_leap(mapper)
+            return False
         offset_s, before_s = (0.0 if clock is None else clock.offset_s for clock in (found, before))
         self.gnss, self.clock = self.gnss.later_by(offset_s - before_s), found
         self.placement = replace(self.placement, track=self.gnss, clock=found)
+        return True
+
+    def _take_lever_arm(self, found: LeverArm | None) -> bool:
+        """Put the antenna where positions show it, None for where it was given; whether it is elsewhere than before."""
+        assert self.antenna_in_rig_m is not None
+        assert self.placement is not None
+        before = self.lever
+        if found is before or (found is not None and before is not None and found.is_as(before)):
+            return False
+        offset_m, before_m = (np.zeros(3) if lever is None else lever.offset_m for lever in (found, before))
+        self.antenna_in_rig_m, self.lever = self.antenna_in_rig_m + offset_m - before_m, found
+        self.placement = replace(self.placement, lever_arm_m=self.antenna_in_rig_m, lever=found)
         return True
 
     def _leave_a_side_of_a_leap(self, mapper: Mapper) -> bool:

@@ -15,7 +15,7 @@ from mrasfm_engine.mapping.calibration import scale_of_baselines
 from mrasfm_engine.mapping.georeferencing import BENDS, assess_residuals
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import beside_a_bent_scene, extent_m, positions_with_errors
-from mrasfm_engine.mapping.receiver_clock import fit_motions, is_probable, track_motions
+from mrasfm_engine.mapping.receiver_clock import fit_motions, log_odds, track_motions
 from mrasfm_engine.mapping.receiver_fit import Placement, antenna_places_m, most_likely_errors
 from mrasfm_engine.mapping.receiver_jumps import AROUND
 from mrasfm_engine.types import Floats
@@ -89,7 +89,7 @@ def find_clock_leap(mapper: Mapper, placement: Placement) -> ClockLeap | None:
     bent_s = BENDS[0] * extent_m(antenna_m) / float(np.sqrt((moves[:, :, 0] ** 2).sum(axis=1).mean()))
     seconds, sigma_s = float(fitted[0][-1]), float(np.hypot(np.sqrt(fitted[1][-1, -1]), bent_s))
     odds = LEAP_SHARE / (1.0 - LEAP_SHARE) / (len(units) - 2 * AROUND)  # at any of so many places
-    if not is_probable(seconds, sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_LEAP_S):
+    if log_odds(seconds, sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_LEAP_S) <= 0.0:
         return None
     at_us, margin_us = mapper.drive.timestamps_us[units], round(1e6 * abs(seconds))
     return ClockLeap(

@@ -24,8 +24,14 @@ from mrasfm_engine.mapping.georeferencing import (
     has_shape,
     similarity_motions,
 )
+from mrasfm_engine.mapping.lever_arm import LeverArm, lever_arm, lever_arm_findings, ways_of_antenna
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.receiver_clock import ReceiverClock, clock_findings, clock_offset
+from mrasfm_engine.mapping.receiver_clock import (
+    MIN_POSITIONS_FOR_CLOCK,
+    ReceiverClock,
+    clock_findings,
+    clock_offset,
+)
 from mrasfm_engine.mapping.receiver_findings import SCALE_DISAGREEMENT_SIGMAS, rig_scale_findings
 from mrasfm_engine.mapping.receiver_fit import (
     MIN_POSITIONS,
@@ -33,6 +39,7 @@ from mrasfm_engine.mapping.receiver_fit import (
     ReceiverErrors,
     antenna_places_m,
     clock_moves_m,
+    lever_moves_m,
     most_likely_errors,
     receiver_errors,
     with_jumps,
@@ -66,6 +73,7 @@ def place_by_gnss(
     rig_may_be_wrong: bool = False,
     thorough: bool = False,
     clock: ReceiverClock | None = None,
+    lever: LeverArm | None = None,
 ) -> Placement:
     """Move the reconstruction into the receiver's frame, and make its positions a prior for the adjustment.
 
@@ -118,6 +126,7 @@ def place_by_gnss(
         noise_factor=alignment.noise_factor,
         track=gnss if mapper.config.bundle_adjustment.reassessment else None,
         clock=clock,
+        lever=lever,
     )
     placement = with_prior(mapper, placement, thorough=thorough)
     if not single:
@@ -281,6 +290,7 @@ def positions_with_errors(
         least_spacing_s=max(settings.correlation_time_s, settings.wander_time_s / KNOTS),
         segment=segment,
         clock_m=clock_moves_m(mapper, placement, units),
+        lever_m=lever_moves_m(mapper, placement, units),
     )
 
 
@@ -374,13 +384,16 @@ def _scale_by_positions(mapper: Mapper, placement: Placement) -> float:
 def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
     """Say by the refined scene what positions make of the rig's lengths as given, and find where they contradict it.
 
-    The receiver's clock, which would explain another length, is a finding of its own. While cameras were where they
-    were given, the scene had another scale by whatever was wrong of them: a rotation or the times of their images as
-    much as a baseline. An adjustment puts that where images show it.
+    The receiver's clock or antenna, which would explain another length, is a finding of its own. While cameras were
+    where they were given, the scene had another scale by whatever was wrong of them: a rotation or the times of their
+    images as much as a baseline. An adjustment puts that where images show it.
     """
     if placement.prior is None:
         return placement
-    placement = replace(placement, findings=[*placement.findings, *clock_findings(placement.clock)])
+    placement = replace(
+        placement,
+        findings=[*placement.findings, *clock_findings(placement.clock), *lever_arm_findings(placement.lever)],
+    )
     if mapper.drive.has_single_camera:
         return placement
     scale = (1.0 + _growth_by_term(mapper, placement)) / scale_of_baselines(mapper)[0]
@@ -408,6 +421,47 @@ def find_clock(mapper: Mapper, placement: Placement) -> ReceiverClock | None:
     positions = with_prior(mapper, replace(placement, clock=unknown), thorough=True).prior
     assert positions is not None
     return _clock_offset(mapper, positions)
+
+
+def find_lever_arm(mapper: Mapper, placement: Placement, *, times_vary: bool) -> LeverArm | None:
+    """The antenna's place, as positions with a prior show it; None where it is taken to be where it was given.
+
+    What a wrong one does is among what the sizes of errors were told from: where positions say rather that it is
+    wrong, these are those of what it leaves. `times_vary` says that all images may have been taken earlier or later.
+    """
+    if not mapper.config.bundle_adjustment.reassessment or placement.inlier.sum() < MIN_POSITIONS_FOR_CLOCK:
+        return None
+    units = placement.units
+    antenna_m = antenna_places_m(mapper, units, placement.lever_arm_m)
+    time_s = mapper.drive.timestamps_us[units] / 1e6
+    ways = ways_of_antenna(antenna_m, mapper.state.unit_rotation[units], time_s, times_vary=times_vary)
+    of_rig, sigma_rig = scale_of_baselines(mapper)
+
+    def found(judged: Placement, off_m: Floats) -> tuple[LeverArm, Floats]:
+        rows = np.flatnonzero(judged.inlier)
+        positions = positions_with_errors(mapper, judged, units[rows], judged.errors)
+        return lever_arm(
+            off_m[rows],
+            ways[rows],
+            beside_a_bent_scene(positions, antenna_m),
+            assumed_m=np.zeros(3) if placement.lever is None else placement.lever.offset_m,
+            factor=1.0 / of_rig,
+            sigma_factor=np.inf if mapper.drive.has_single_camera else sigma_rig,
+        )
+
+    off_m = -placement.residuals_m
+    result, sizes = found(placement, off_m)
+    if placement.lever is not None or not result.may_be_wrong:
+        return result
+    left_m = ways @ sizes - off_m
+    inlier, factor = assess_residuals(
+        left_m, placement.known_sigma_m[units], placement.inlier, outlier_sigmas=mapper.config.gnss.outlier_sigmas
+    )
+    if inlier.sum() < MIN_POSITIONS_FOR_CLOCK:
+        return result
+    judged = replace(placement, lever=LeverArm.unknown(), off_m=left_m, inlier=inlier, noise_factor=factor)
+    judged = replace(judged, errors=most_likely_errors(mapper, judged, clock_varies=times_vary))
+    return found(judged, off_m)[0]
 
 
 def _clock_offset(mapper: Mapper, positions: ReceiverPositions) -> ReceiverClock | None:

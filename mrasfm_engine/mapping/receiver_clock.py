@@ -35,24 +35,29 @@ class ReceiverClock:
     sigma_s: float
 
     @property
-    def is_wrong(self) -> bool:
-        """True where it is more probable that it is wrong than that it is right [the odds of Bayes' theorem]."""
+    def log_odds(self) -> float:
+        """Logarithm of the odds that it is wrong [Bayes' theorem]."""
         odds = WRONG_SHARE / (1.0 - WRONG_SHARE)
-        return is_probable(self.offset_s, self.sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_WRONG_CLOCK_S)
+        return log_odds(self.offset_s, self.sigma_s, odds=odds, sigma_of_wrong_s=SIGMA_OF_WRONG_CLOCK_S)
+
+    @property
+    def is_wrong(self) -> bool:
+        """True where it is more probable that it is wrong than that it is right."""
+        return self.log_odds > 0.0
 
     def is_as(self, other: ReceiverClock) -> bool:
         """True where both agree but for less than their sigmas can tell."""
         return abs(self.offset_s - other.offset_s) < STEADY_SIGMAS * self.sigma_s
 
 
-def is_probable(seconds: float, sigma_s: float, *, odds: float, sigma_of_wrong_s: float) -> bool:
-    """True where an error of a clock, as estimated, is more probable than none [the odds of Bayes' theorem].
+def log_odds(seconds: float, sigma_s: float, *, odds: float, sigma_of_wrong_s: float) -> float:
+    """Logarithm of the odds of an error of a clock, as estimated, against none [Bayes' theorem].
 
     `odds` are those before positions say anything, and errors then are normal with `sigma_of_wrong_s`.
     """
     of_wrong = np.hypot(sigma_s, sigma_of_wrong_s)
     squared = seconds**2 * (sigma_s**-2 - of_wrong**-2)
-    return bool(np.log(odds * sigma_s / of_wrong) + 0.5 * squared > 0.0)
+    return float(np.log(odds * sigma_s / of_wrong) + 0.5 * squared)
 
 
 def clock_offset(
@@ -93,10 +98,9 @@ def fit_motions(
 
     See `clock_offset` for the factor, of the second of them. None where nothing tells one of them.
     """
-    off_m = (positions.position_m - antenna_m)[:, :, None]
-    known = replace(positions, clock_m=None).information(np.concatenate([moves, off_m], axis=2))
-    known[1, 1] += sigma_factor**-2
-    known[1, -1] += (factor - 1.0) * sigma_factor**-2
+    positions = replace(positions, clock_m=None)
+    off_m = positions.position_m - antenna_m
+    known = normal_equations(off_m, positions, moves, grows=1, factor=factor, sigma_factor=sigma_factor)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[:-1], 1e-12))
     matrix, right = known[:-1, :-1] * np.outer(scale, scale), known[:-1, -1] * scale
     if np.linalg.eigvalsh(matrix)[0] < SINGULAR:
@@ -104,6 +108,19 @@ def fit_motions(
     solution = np.linalg.solve(matrix, right)
     noise = max(1.0, float(known[-1, -1] - right @ solution) / off_m.size)
     return solution * scale, noise * np.linalg.inv(matrix) * np.outer(scale, scale)
+
+
+def normal_equations(
+    off_m: Floats, positions: ReceiverPositions, moves: Floats, *, grows: int, factor: float, sigma_factor: float
+) -> Floats:
+    """Information (k + 1, k + 1) on moves (n, 3, k) of places, and last on what positions are off them (n, 3).
+
+    `grows` is the number of the move that lets the places grow, of which a factor is known.
+    """
+    known = positions.information(np.concatenate([moves, off_m[:, :, None]], axis=2))
+    of_factor = np.array([1.0, factor - 1.0]) / sigma_factor
+    known[np.ix_([grows, -1], [grows, -1])] += np.outer(of_factor, of_factor)
+    return known
 
 
 def clock_findings(clock: ReceiverClock | None) -> list[Finding]:

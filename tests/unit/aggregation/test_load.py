@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from mrasfm_engine.aggregation.load import name_scenes, read_scene
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.errors import InputError
 from mrasfm_engine.export.scene import write_scene
+from schemas import Gnss, GnssSample
 from tests.helpers.export_example import make_scene, withheld_files
 
 
@@ -49,6 +51,33 @@ def test_a_folder_may_have_any_name(tmp_path: Path) -> None:
     assert (folder / "trajectory.gpkg").is_file()
     assert withheld_files(folder) == []
     assert len(read_scene(folder, "one").keypoint_point) > 0
+
+
+def test_the_receiver_is_as_the_scene_found_it(tmp_path: Path) -> None:
+    """Its antenna and its clock; the scene's own manifest has what was given."""
+    example = make_scene()
+    sigmas = {"sigma_horizontal_m": 1.0, "sigma_vertical_m": 2.0}
+    samples = [
+        GnssSample(timestamp_us=second * 1_000_000, latitude_deg=49.0, longitude_deg=8.4, height_m=110.0, **sigmas)
+        for second in range(4)
+    ]
+    gnss = Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[0.0, 0.0, 1.6], samples=samples)
+    example = replace(
+        example,
+        drive=replace(example.drive, manifest=example.drive.manifest.model_copy(update={"gnss": gnss})),
+    )
+    found = {"antenna": {"in_rig_m": [0.5, -0.3, 1.7]}, "clock_offset_s": -0.25}
+    stages = [{"stage": "mapping"}, {"stage": "refinement", "gnss": found}]
+    write_scene(example, tmp_path / "scene", {"settings": {"features": {"extractor": "sift"}}, "stages": stages})
+    read = read_scene(tmp_path / "scene", "one").manifest.gnss
+    assert read is not None
+    assert list(read.antenna_in_rig_m) == [0.5, -0.3, 1.7]
+    assert [sample.timestamp_us for sample in read.samples] == [750_000, 1_750_000, 2_750_000]
+    report = json.loads((tmp_path / "scene" / "report.json").read_text())
+    report["stages"][1]["gnss"]["antenna"]["in_rig_m"] = [1e9, 0.0, 0.0]
+    (tmp_path / "scene" / "report.json").write_text(json.dumps(report))
+    with pytest.raises(InputError, match=r"scene one: .*report.json is damaged"):
+        read_scene(tmp_path / "scene", "one")
 
 
 def test_packing_changes_nothing(folder: Path) -> None:

@@ -58,15 +58,25 @@ def jumping(term: ReceiverPositions, first: int) -> ReceiverPositions:
     return replace(term, segment=segment, knots_s=time_of_process_s(term.time_s, segment, WANDER_TIME_S))
 
 
-def with_clock(term: ReceiverPositions, state: State) -> ReceiverPositions:
-    """The term of a receiver whose clock is known to 0.3 s."""
-    return replace(term, clock_m=0.3 * np.gradient(state.unit_position_m, term.time_s, axis=0))
+COMMON = [(), ("clock",), ("lever",), ("clock", "lever")]
+
+
+def with_common(term: ReceiverPositions, state: State, common: tuple[str, ...] = ("clock",)) -> ReceiverPositions:
+    """The term of a receiver whose clock is known to 0.3 s, or whose antenna's place is to a metre."""
+    if "clock" in common:
+        term = replace(term, clock_m=0.3 * np.gradient(state.unit_position_m, term.time_s, axis=0))
+    return replace(term, lever_m=state.unit_rotation.copy()) if "lever" in common else term
 
 
 def whole_covariance(term: ReceiverPositions) -> np.ndarray:
-    """Covariance (3 n, 3 n) of the errors along x, then y, then z, with that of the clock."""
+    """Covariance (3 n, 3 n) of the errors along x, then y, then z, with those that all have in common."""
     result: np.ndarray = scipy.linalg.block_diag(*covariances(term))
-    return result if term.clock_m is None else result + np.outer(term.clock_m.T.ravel(), term.clock_m.T.ravel())
+    if term.clock_m is not None:
+        result = result + np.outer(term.clock_m.T.ravel(), term.clock_m.T.ravel())
+    if term.lever_m is not None:
+        ways = np.swapaxes(term.lever_m, 0, 1).reshape(-1, 3)
+        result = result + ways @ ways.T
+    return result
 
 
 def covariances(term: ReceiverPositions) -> list[np.ndarray]:
@@ -144,7 +154,7 @@ def test_knots_of_samples_begin_anew_at_a_jump() -> None:
 def test_a_clock_costs_what_the_error_costs_that_it_makes_of_all_positions() -> None:
     rng = np.random.default_rng(0)
     state = moving(rng)
-    term = with_clock(received(state, rng, loss_scale=1e6), state)
+    term = with_common(received(state, rng, loss_scale=1e6), state)
     for late_s in (0.0, 0.6):
         late = replace(term, position_m=term.position_m - late_s / 0.3 * term.clock_m)
         off_m = (state.unit_position_m + state.unit_rotation @ ARM_M - late.position_m).T.ravel()
@@ -156,10 +166,25 @@ def test_a_clock_costs_what_the_error_costs_that_it_makes_of_all_positions() -> 
     np.testing.assert_allclose(late.errors_m(state), seen_m, atol=1e-6)
 
 
-def test_likelihood_with_a_clock_is_that_of_its_covariance() -> None:
+def test_an_antenna_elsewhere_costs_what_the_error_costs_that_it_makes_of_all_positions() -> None:
+    rng = np.random.default_rng(0)
+    state = moving(rng)
+    term = with_common(received(state, rng, loss_scale=1e6), state, ("lever",))
+    off_by_m = np.array([0.8, -1.5, 0.2])
+    for wrong in (term, replace(term, position_m=term.position_m + state.unit_rotation @ off_by_m)):
+        off_m = (state.unit_position_m + state.unit_rotation @ ARM_M - wrong.position_m).T.ravel()
+        expected = 0.5 * off_m @ np.linalg.solve(whole_covariance(wrong), off_m)
+        assert wrong.cost(state) == pytest.approx(expected, rel=1e-9)
+    assert wrong.cost(state) < replace(wrong, lever_m=None).cost(state) - 1.0
+    seen_m = (wrong.errors_m(state) - term.errors_m(state)) / (state.unit_rotation @ off_by_m)
+    assert np.median(seen_m) > 0.9
+
+
+@pytest.mark.parametrize("common", COMMON)
+def test_likelihood_with_common_errors_is_that_of_their_covariance(common: tuple[str, ...]) -> None:
     rng = np.random.default_rng(6)
     state = moving(rng)
-    term = with_clock(received(state, rng), state)
+    term = with_common(received(state, rng), state, common)
     off_m = state.unit_position_m + state.unit_rotation @ ARM_M - term.position_m
     moves = np.tile(np.eye(3), (UNITS, 1, 1))
 
@@ -179,14 +204,14 @@ def test_likelihood_with_a_clock_is_that_of_its_covariance() -> None:
 
 
 @pytest.mark.parametrize("jump", [False, True])
-@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("common", COMMON)
 @pytest.mark.parametrize("fixed", [None, 4])
-def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, clock: bool, jump: bool) -> None:
+def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, common: tuple[str, ...], jump: bool) -> None:
     rng = np.random.default_rng(1)
     state, layout = moving(rng), free_units(fixed)
     term = received(state, rng, loss_scale=1e6)
     term = jumping(term, 5) if jump else term
-    term = with_clock(term, state) if clock else term
+    term = with_common(term, state, common)
     extra = Extra.none(layout)
     term.add_to(state, layout, extra)
     units = np.flatnonzero(layout.unit_slot >= 0)
@@ -199,12 +224,12 @@ def test_matrix_is_the_information_of_correlated_errors(fixed: int | None, clock
     np.testing.assert_allclose(extra.matrix, expected, atol=1e-8 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize("clock", [False, True])
-def test_gradient_is_that_of_the_cost(clock: bool) -> None:
+@pytest.mark.parametrize("common", COMMON)
+def test_gradient_is_that_of_the_cost(common: tuple[str, ...]) -> None:
     rng = np.random.default_rng(2)
     state, layout = moving(rng), free_units()
     term = received(state, rng)
-    term = with_clock(term, state) if clock else term
+    term = with_common(term, state, common)
     term.position_m[3] += [5.0, -3.0, 2.0]
     extra = Extra.none(layout)
     term.add_to(state, layout, extra)
@@ -293,23 +318,25 @@ def test_clusters_of_samples_share_what_knots_leave_out() -> None:
     assert 0.97 < (1.0 / float(term.information(columns)[0, 0])) / exact < 30.0
 
 
-@pytest.mark.parametrize("clock", [False, True])
+@pytest.mark.parametrize("common", COMMON)
 @pytest.mark.parametrize("knots", [1, 5, UNITS])
-def test_the_best_states_solve_the_system_of_their_weights(knots: int, clock: bool) -> None:
+def test_the_best_states_solve_the_system_of_their_weights(knots: int, common: tuple[str, ...]) -> None:
     rng = np.random.default_rng(7)
     state = moving(rng)
     term = received(state, rng, knots_s=np.linspace(0.0, 2.0 * (UNITS - 1), knots), loss_scale=2.0)
-    term = with_clock(term, state) if clock else term
+    term = with_common(term, state, common)
     whitened = term._whitened(state)[1]
-    states, of_clock, residuals, weights = term._best(whitened)
-    assert (abs(of_clock) > 0.01) is clock
+    states, of_common, residuals, weights = term._best(whitened)
+    assert len(of_common) == term.common_m.shape[2] == ("clock" in common) + 3 * ("lever" in common)
+    assert (np.abs(of_common) > 1e-3).all()
     assert 0.0 < weights.min() < 0.9
-    np.testing.assert_allclose(residuals, whitened - term._at_samples(states, of_clock), atol=1e-12)
+    np.testing.assert_allclose(residuals, whitened - term._at_samples(states, of_common), atol=1e-12)
     np.testing.assert_allclose(weights, 1.0 / (1.0 + (residuals**2).sum(1) / 4.0), atol=1e-6)
-    without = whitened - of_clock * term._clock
+    without = whitened - term._common @ of_common
     for axis in range(3):
         off, diagonal = term._by_knots(weights, axis)
         matrix = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
         right = term._at_knots((weights * without[:, axis])[:, None], axis)[:, 0]
         np.testing.assert_allclose(matrix @ states[:, axis], right, rtol=1e-5, atol=1e-5)
-    assert of_clock == pytest.approx(float((weights[:, None] * term._clock * residuals).sum()), rel=1e-4, abs=1e-6)
+    pulled = np.einsum("nac,n,na->c", term._common, weights, residuals)
+    np.testing.assert_allclose(of_common, pulled, rtol=1e-4, atol=1e-6)

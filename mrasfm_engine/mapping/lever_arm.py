@@ -1,0 +1,152 @@
+"""The antenna's place in the rig against the one that was given.
+
+A lever arm with a wrong sign, or from another point of the vehicle than the rig's origin, is off by something that
+turns with the vehicle. On a straight way that shifts all positions alike. A turn is wider or narrower by it, which
+looks like a scene of another length, by per cents of one with good positions; or it begins late or early, as if the
+clock were off.
+
+A place is taken to be right, as the manifest says, until it is more probable that it is wrong. Then it is three more
+unknowns of the adjustment (`ReceiverPositions.lever_m`), and the antenna stands where these say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mrasfm_engine.bundle_adjustment.receiver_positions import AXES, ReceiverPositions
+from mrasfm_engine.mapping.receiver_clock import STEADY_SIGMAS, normal_equations, track_motions
+from mrasfm_engine.types import Floats
+from schemas.findings import Finding, warning
+
+# Before positions say anything: the share of lever arms that are wrong, and how far those are off along each axis: by
+# what is between one point and another of a car.
+WRONG_SHARE, SIGMA_OF_WRONG_M = 0.05, 1.0
+LOG_ODDS_BEFORE = float(np.log(WRONG_SHARE / (1.0 - WRONG_SHARE)))
+_TOLD = 0.5  # of that sigma, below which positions tell where the antenna is along an axis
+_DIRECTIONS = (("ahead of", "behind"), ("to the left of", "to the right of"), ("above", "below"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class LeverArm:
+    """Offset (3,) of the antenna from where it was given, in the rig's axes, and its sigmas (3,).
+
+    `log_odds` is the logarithm of the odds that it was given wrongly [Bayes' theorem].
+    """
+
+    offset_m: Floats
+    sigma_m: Floats
+    log_odds: float
+
+    @staticmethod
+    def unknown() -> LeverArm:
+        """One of which positions have not been asked."""
+        return LeverArm(offset_m=np.zeros(AXES), sigma_m=np.full(AXES, SIGMA_OF_WRONG_M), log_odds=0.0)
+
+    @property
+    def is_wrong(self) -> bool:
+        """True where it is more probable that the antenna is elsewhere than that it is where it was given."""
+        return self.log_odds > 0.0
+
+    @property
+    def may_be_wrong(self) -> bool:
+        """True where positions say rather that it is elsewhere."""
+        return self.log_odds > LOG_ODDS_BEFORE
+
+    def is_as(self, other: LeverArm) -> bool:
+        """True where both agree but for less than their sigmas can tell."""
+        return bool((np.abs(self.offset_m - other.offset_m) < STEADY_SIGMAS * self.sigma_m).all())
+
+
+def lever_arm(
+    off_m: Floats,
+    ways: Floats,
+    positions: ReceiverPositions,
+    *,
+    assumed_m: Floats,
+    factor: float = 1.0,
+    sigma_factor: float = np.inf,
+) -> tuple[LeverArm, Floats]:
+    """The lever arm that measured positions have against places of the antenna.
+
+    Parameters
+    ----------
+    off_m
+        Measured positions less these places (n, 3).
+    ways
+        (n, 3, k), see `ways_of_antenna`.
+    assumed_m
+        Offset (3,) from where the antenna was given, at which it is taken to be there.
+    factor, sigma_factor
+        What is known without the receiver of the factor by which the places have to grow.
+
+    Returns
+    -------
+    LeverArm
+    sizes : (k,)
+        By how much the places have to move along the ways.
+    """
+    known = normal_equations(
+        off_m, replace(positions, lever_m=None), ways, grows=AXES, factor=factor, sigma_factor=sigma_factor
+    )
+    own, rest = slice(0, AXES), slice(AXES, -1)
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[rest], 1e-12))
+    scale = np.outer(scale, scale)
+    inverse = scale * np.linalg.pinv(scale * known[rest, rest], rcond=1e-12, hermitian=True)
+    matrix = known[own, own] - known[own, rest] @ inverse @ known[rest, own]
+    right = known[own, -1] - known[own, rest] @ inverse @ known[rest, -1]
+    left = float(known[-1, -1] - known[-1, rest] @ inverse @ known[rest, -1])
+    prior = np.eye(AXES) / SIGMA_OF_WRONG_M**2
+    step_m = np.linalg.solve(matrix + prior, right - prior @ assumed_m)
+    noise = max(1.0, (left - float(right @ step_m)) / off_m.size)
+    result = _judged(matrix / noise, (right + matrix @ assumed_m) / noise)
+    return result, np.concatenate([step_m, inverse @ (known[rest, -1] - known[rest, own] @ step_m)])
+
+
+def ways_of_antenna(antenna_m: Floats, rotation: Floats, time_s: Floats, *, times_vary: bool) -> Floats:
+    """Ways (n, 3, k) in which places (n, 3) of an antenna move: along the rig's axes by a metre, by growth, and others.
+
+    Parameters
+    ----------
+    rotation
+        The rig's (n, 3, 3) there.
+    times_vary
+        Whether all images may have been taken earlier or later, too.
+    """
+    by_time, others = np.split(track_motions(antenna_m, time_s), [1], axis=2)
+    ways = [rotation, others, by_time] if times_vary else [rotation, others]
+    return np.concatenate(ways, axis=2)
+
+
+def _judged(matrix: Floats, right: Floats) -> LeverArm:
+    """The lever arm by normal equations about where it was given, if offsets of wrong ones are normal."""
+    prior = np.eye(AXES) / SIGMA_OF_WRONG_M**2
+    posterior = matrix + prior
+    offset_m = np.asarray(np.linalg.solve(posterior, right), dtype=np.float64)
+    evidence = float(right @ offset_m) - float(np.linalg.slogdet(posterior)[1] - np.linalg.slogdet(prior)[1])
+    return LeverArm(
+        offset_m=offset_m,
+        sigma_m=np.sqrt(np.diagonal(np.linalg.inv(posterior))),
+        log_odds=LOG_ODDS_BEFORE + 0.5 * evidence,
+    )
+
+
+def lever_arm_findings(lever: LeverArm | None) -> list[Finding]:
+    """The finding that the antenna is elsewhere; none where it is taken to be where it was given."""
+    if lever is None:
+        return []
+    told = [
+        f"{abs(off_m):.2f} m {names[0 if off_m > 0 else 1]} (sigma {sigma_m:.2f} m)"
+        for off_m, sigma_m, names in zip(lever.offset_m, lever.sigma_m, _DIRECTIONS, strict=True)
+        if sigma_m < _TOLD * SIGMA_OF_WRONG_M
+    ]
+    return [
+        warning(
+            "antenna-position",
+            f"by the shape of the way, the antenna is {' and '.join(told)} where gnss.antenna_in_rig_m says: the scene "
+            "takes it to be there",
+            "Check gnss.antenna_in_rig_m: its signs, its axes (rig.body_axes), and that it begins at the rig's origin, "
+            "from which rig_from_cam is given.",
+        )
+    ]

@@ -1,0 +1,115 @@
+"""The antenna's place in the rig: told from the shape of the way, and corrected where it is clearly wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mrasfm_engine.geometry import se3
+from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
+from mrasfm_engine.mapping.lever_arm import LeverArm, lever_arm, lever_arm_findings, ways_of_antenna
+from mrasfm_engine.mapping.mapping_report import describe_refinement
+from mrasfm_engine.mapping.refinement import refine
+from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
+from tests.unit.mapping.test_placement import ARM_M, received
+from tests.unit.mapping.test_receiver_clock import UNITS, measured
+
+TIMES_S = np.arange(80) * 0.2
+HERE = np.zeros(3)
+
+
+def turning(radius_m: float = 30.0) -> tuple[np.ndarray, np.ndarray]:
+    """Places and rotations of a vehicle that turns by some 150 degrees, after a straight."""
+    heading = np.maximum(0.0, 8.0 * (TIMES_S - 5.0)) / radius_m
+    velocity = 8.0 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], 1)
+    place_m = np.cumsum(velocity, axis=0) * 0.2
+    return place_m, se3.exp_so3(np.stack([0 * heading, 0 * heading, heading], 1))
+
+
+def found_by(
+    offset_m: tuple[float, float, float], *, white_m: float = 0.05, straight: bool = False, **known: float
+) -> LeverArm:
+    """The lever arm of an antenna that is elsewhere by so much than was given."""
+    place_m, rotation = turning(radius_m=1e9 if straight else 30.0)
+    noise_m = white_m * np.random.default_rng(0).normal(size=place_m.shape)
+    positions = measured(place_m + rotation @ np.array(offset_m) + noise_m, TIMES_S, white_m=white_m, wander_m=0.0)
+    ways = ways_of_antenna(place_m, rotation, TIMES_S, times_vary=False)
+    return lever_arm(positions.position_m - place_m, ways, positions, assumed_m=HERE, **known)[0]
+
+
+@pytest.mark.parametrize("offset_m", [(0.0, 0.6, 0.0), (0.0, -0.6, 0.0), (1.2, 0.0, 0.0), (-0.5, 0.4, 0.0)])
+def test_an_antenna_elsewhere_is_told_with_its_sign(offset_m: tuple[float, float, float]) -> None:
+    found = found_by(offset_m)
+    assert found.is_wrong
+    np.testing.assert_allclose(found.offset_m[:2], offset_m[:2], atol=4 * found.sigma_m[:2].max())
+    assert 0.005 < found.sigma_m[:2].max() < 0.12
+    assert found.sigma_m[2] > 0.9  # a higher antenna is a higher world
+
+
+def test_an_antenna_that_is_where_it_was_given_stays_there() -> None:
+    found = found_by((0.0, 0.0, 0.0))
+    assert not found.may_be_wrong
+    assert (np.abs(found.offset_m) < 4 * found.sigma_m).all()
+
+
+def test_an_antenna_cannot_be_told_on_a_straight_way() -> None:
+    found = found_by((0.5, 0.8, 0.3), straight=True)
+    assert not found.is_wrong
+    np.testing.assert_allclose(found.offset_m, 0.0, atol=0.05)
+    np.testing.assert_allclose(found.sigma_m, 1.0, atol=0.05)
+
+
+def test_a_scale_that_is_known_otherwise_tells_the_antenna_better() -> None:
+    """A turn is wider by an antenna farther out, and by a scene that is larger."""
+    free, known = (found_by((0.0, 0.6, 0.0), white_m=0.3, sigma_factor=sigma) for sigma in (np.inf, 1e-4))
+    assert known.sigma_m[1] < 0.8 * free.sigma_m[1]
+    assert known.is_wrong
+
+
+def test_a_better_guess_leads_to_the_same_place() -> None:
+    """The odds are those against where the antenna was given, wherever it is taken to be."""
+    place_m, rotation = turning()
+    at_m = np.array([0.4, -0.7, 0.0])
+    noise_m = 0.05 * np.random.default_rng(2).normal(size=place_m.shape)
+    positions = measured(place_m + rotation @ at_m + noise_m, TIMES_S, white_m=0.05, wander_m=0.0)
+    found = []
+    for assumed_m in (HERE, at_m):
+        antenna_m = place_m + rotation @ assumed_m
+        ways = ways_of_antenna(antenna_m, rotation, TIMES_S, times_vary=False)
+        found.append(lever_arm(positions.position_m - antenna_m, ways, positions, assumed_m=assumed_m)[0])
+    np.testing.assert_allclose(found[0].offset_m, found[1].offset_m, atol=0.02)
+    assert found[0].log_odds == pytest.approx(found[1].log_odds, rel=0.05)
+    assert found[0].is_as(found[1])
+    assert not found[0].is_as(LeverArm.unknown())
+
+
+@pytest.mark.parametrize("wrong_by_m", [(0.0, 0.0, 0.0), (0.0, 0.9, 0.0), (-0.8, -0.4, 0.0)])
+def test_a_wrong_lever_arm_is_found_and_does_not_change_the_scene(wrong_by_m: tuple[float, float, float]) -> None:
+    simulated = make_simulated_drive(units=UNITS, cameras=2, points=2000)
+    mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+    mapper.complete()
+    given_m = ARM_M + wrong_by_m
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.02), antenna_in_rig_m=given_m))
+    assert result.placement is not None
+    assert result.certainty is not None
+    assert [f.code for f in result.placement.findings] == (["antenna-position"] if any(wrong_by_m) else [])
+    scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert abs(scale - 1.0) < 3 * result.certainty.sigma_scale
+    assert 1e-5 < result.certainty.sigma_scale < 0.01
+    report = describe_refinement(mapper, result)["gnss"]
+    if any(wrong_by_m):
+        sigma_m = np.array(report["antenna"]["sigma_m"])
+        np.testing.assert_allclose(report["antenna"]["in_rig_m"][:2], ARM_M[:2], atol=4 * sigma_m[:2].max())
+        np.testing.assert_allclose(np.add(given_m, report["antenna"]["offset_m"]), report["antenna"]["in_rig_m"])
+        assert sigma_m[:2].max() < 0.2
+    else:
+        assert "antenna" not in report
+
+
+def test_the_finding_says_what_is_told() -> None:
+    lever = LeverArm(offset_m=np.array([-0.31, 0.72, 0.4]), sigma_m=np.array([0.05, 0.04, 0.97]), log_odds=9.0)
+    (finding,) = lever_arm_findings(lever)
+    assert "0.31 m behind (sigma 0.05 m) and 0.72 m to the left of (sigma 0.04 m) where" in finding.what
+    assert "above" not in finding.what
+    assert lever_arm_findings(None) == []
