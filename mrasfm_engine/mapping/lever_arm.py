@@ -136,10 +136,11 @@ def lever_arm_findings(lever: LeverArm | None) -> list[Finding]:
     """The finding that the antenna is elsewhere; none where it is taken to be where it was given."""
     if lever is None:
         return []
+    clearest = int(np.argmax(np.abs(lever.offset_m) / lever.sigma_m))
     told = [
         f"{abs(off_m):.2f} m {names[0 if off_m > 0 else 1]} (sigma {sigma_m:.2f} m)"
-        for off_m, sigma_m, names in zip(lever.offset_m, lever.sigma_m, _DIRECTIONS, strict=True)
-        if sigma_m < _TOLD * SIGMA_OF_WRONG_M
+        for axis, (off_m, sigma_m, names) in enumerate(zip(lever.offset_m, lever.sigma_m, _DIRECTIONS, strict=True))
+        if axis == clearest or sigma_m < _TOLD * SIGMA_OF_WRONG_M
     ]
     return [
         warning(

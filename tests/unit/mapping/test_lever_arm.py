@@ -112,4 +112,6 @@ def test_the_finding_says_what_is_told() -> None:
     (finding,) = lever_arm_findings(lever)
     assert "0.31 m behind (sigma 0.05 m) and 0.72 m to the left of (sigma 0.04 m) where" in finding.what
     assert "above" not in finding.what
+    unsure = LeverArm(offset_m=np.array([0.3, 2.9, 0.0]), sigma_m=np.array([0.7, 0.8, 0.99]), log_odds=2.0)
+    assert "is 2.90 m to the left of (sigma 0.80 m) where" in lever_arm_findings(unsure)[0].what
     assert lever_arm_findings(None) == []
