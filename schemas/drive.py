@@ -1,6 +1,7 @@
 """The drive manifest, `drive.json`, version 2: one recording of one vehicle, ready to be reconstructed.
 
-Version 1 is read as well: it has none of `FIELDS_OF_VERSION_2` and `DRIVE_FIELDS_OF_VERSION_2`.
+Version 1 is read as well: it has none of `FIELDS_OF_VERSION_2`, `GNSS_FIELDS_OF_VERSION_2` and
+`DRIVE_FIELDS_OF_VERSION_2`.
 
 Conventions: a transform is named `a_from_b` and maps coordinates of frame b into frame a; rotations are unit
 quaternions in the order x, y, z, w; lengths are metres, angles degrees, times integer microseconds.
@@ -45,6 +46,7 @@ CAMERA_MODELS: dict[str, tuple[str, ...]] = {
 FIELDS_OF_VERSION_2 = frozenset(
     {"sigma_principal_point_px", "sigma_distortion", "sigma_time_offset_us", "readout_direction"}
 )  # of Camera
+GNSS_FIELDS_OF_VERSION_2 = frozenset({"sigma_antenna_m"})
 DRIVE_FIELDS_OF_VERSION_2 = frozenset({"vehicle"})
 
 MAX_CAMERAS = 64
@@ -303,6 +305,11 @@ class Gnss(_Model):
         description="what height_m counts from: 'ellipsoidal' (WGS84), or the EPSG code of a vertical datum",
     )
     antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")
+    sigma_antenna_m: Sigma | None = Field(
+        None,
+        description="since version 2: how well it is known, per axis; without it, it is exact until positions "
+        "contradict that",
+    )
     samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES), FailFast()] = Field(
         description="in order of time; they need not coincide with frames"
     )
@@ -429,6 +436,9 @@ class DriveManifest(_Model):
     def _consistent(self) -> DriveManifest:
         for name in sorted(DRIVE_FIELDS_OF_VERSION_2 & self.model_fields_set if self.version == 1 else ()):
             raise ValueError(f"{name} is of version 2 of the contract: set version to 2")
+        of_gnss = set() if self.gnss is None else GNSS_FIELDS_OF_VERSION_2 & self.gnss.model_fields_set
+        for name in sorted(of_gnss if self.version == 1 else ()):
+            raise ValueError(f"gnss.{name} is of version 2 of the contract: set version to 2")
         for i, camera in enumerate(self.rig.cameras if self.version == 1 else ()):
             for name in sorted(FIELDS_OF_VERSION_2 & camera.model_fields_set):
                 raise ValueError(f"rig.cameras.{i}.{name} is of version 2 of the contract: set version to 2")

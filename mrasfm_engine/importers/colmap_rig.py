@@ -38,6 +38,7 @@ from schemas.drive import MAX_CAMERAS, MAX_FRAMES, Finite, Vector3
 from schemas.file_names import is_ignored
 
 DESCRIPTION = "rig_config.json (COLMAP)"
+SIGMA_ANTENNA_M = 1.0  # of an antenna of which nothing is said: it stands somewhere on the vehicle
 OPTIONS = ("scene", "forward_camera", "rate_hz", "antenna_m", "gnss_sigma_m")
 CONFIG, POSITIONS = "rig_config.json", "geo.txt"
 VERTICAL_OVER_HORIZONTAL = 2.0  # where only one standard deviation is known
@@ -351,6 +352,9 @@ def _gnss(
     if len(known) < len(frames):
         notes.append(f"GNSS: {len(frames) - len(known)} frames have no position.")
     if antenna_m is None:
-        notes.append("GNSS: the antenna is taken to be at the reference camera; --antenna gives another place.")
-        return gnss, notes
+        notes.append(
+            f"GNSS: the antenna is taken to be at the reference camera, but for {SIGMA_ANTENNA_M:g} m; --antenna gives "
+            "its place."
+        )
+        return gnss.model_copy(update={"sigma_antenna_m": SIGMA_ANTENNA_M}), notes
     return gnss.model_copy(update={"antenna_in_rig_m": antenna_on_vehicle(antenna_m)}), notes

@@ -19,7 +19,7 @@ from mrasfm_engine.io.trajectory_file import format_tum
 from mrasfm_engine.preflight.drive_reader import MANIFEST_NAME, foreign_file, write_manifest
 from mrasfm_engine.scene.drive import pose_from_matrix
 from schemas import DriveManifest, Frame, FrameImage, Rig, RoughPose, RoughTrajectory
-from schemas.drive import FIELDS_OF_VERSION_2
+from schemas.drive import FIELDS_OF_VERSION_2, GNSS_FIELDS_OF_VERSION_2
 from schemas.file_names import TRUTH_NAME
 from schemas.parsing import file_problems
 
@@ -208,7 +208,9 @@ def _manifest(recording: Recording) -> DriveManifest:
 
 
 def _needs_version_2(recording: Recording) -> bool:
-    fields = (FIELDS_OF_VERSION_2 & camera.model_fields_set for camera in recording.cameras)
+    fields = [FIELDS_OF_VERSION_2 & camera.model_fields_set for camera in recording.cameras]
+    if recording.gnss is not None:
+        fields.append(GNSS_FIELDS_OF_VERSION_2 & recording.gnss.model_fields_set)
     return recording.vehicle is not None or any(fields)
 
 

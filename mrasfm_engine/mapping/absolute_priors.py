@@ -20,13 +20,12 @@ from mrasfm_engine.mapping.lever_arm import LeverArm
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.placement import (
     factor_by_gnss,
-    find_clock,
-    find_lever_arm,
     place_by_gnss,
     positions_of_units,
     reassess_positions,
 )
 from mrasfm_engine.mapping.receiver_clock import ReceiverClock
+from mrasfm_engine.mapping.receiver_faults import find_clock, find_lever_arm
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
 from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses, shape_fault
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -44,6 +43,8 @@ class AbsolutePriors:
     ----------
     gnss, antenna_in_rig_m
         The receiver's track in the local frame and the lever arm (3,), or None.
+    sigma_antenna_m
+        Standard deviation of the lever arm as it was given, along each axis; 0 where it is taken to be exact.
     rough_world_from_rig
         Rough poses (units, 4, 4) in their own world, NaN where unknown, or None.
     placement
@@ -58,6 +59,7 @@ class AbsolutePriors:
 
     gnss: GnssTrack | None = None
     antenna_in_rig_m: Floats | None = None
+    sigma_antenna_m: float = 0.0
     rough_world_from_rig: Floats | None = None
     placement: Placement | None = None
     rough: Placement | None = None
@@ -65,7 +67,7 @@ class AbsolutePriors:
     rough_fault: str = ""
     placed_by_rough_poses: bool = False
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
-    lever: LeverArm | None = None  # by which the lever arm is another one than was given; None where that is right
+    lever: LeverArm | None = None  # where the lever arm is estimated: by how much it is another one than was given
     clock_leap: ClockLeap | None = None  # of that clock, behind or before which positions take no part
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
@@ -75,6 +77,7 @@ class AbsolutePriors:
         return AbsolutePriors(
             gnss=known.gnss,
             antenna_in_rig_m=known.antenna_in_rig_m,
+            sigma_antenna_m=known.sigma_antenna_m,
             rough_world_from_rig=known.rough_world_from_rig,
         )
 
@@ -205,13 +208,18 @@ class AbsolutePriors:
             return False
         clock = None if self.clock_varies else find_clock(mapper, self.placement)
         clock = clock if clock is not None and clock.is_wrong else None
-        lever = find_lever_arm(mapper, self.placement, times_vary=self.clock_varies)
-        lever = lever if lever is not None and lever.is_wrong else None
-        if clock is not None and lever is not None and self.clock is None and self.lever is None:
-            clock, lever = (clock, None) if clock.log_odds >= lever.log_odds else (None, lever)
+        lever = find_lever_arm(mapper, self.placement, sigma_given_m=self.sigma_antenna_m, times_vary=self.clock_varies)
+        lever = lever if lever is not None and lever.varies else None
+        if clock is not None and lever is not None and self.clock is None and lever.is_wrong and not self._has_moved:
+            clock, lever = (clock, self.lever) if clock.log_odds >= lever.log_odds else (None, lever)
         is_other = False if self.clock_varies else self._take_clock(clock)
         is_other |= self._take_lever_arm(lever)
         return is_other or (clock is not None and self._leave_a_side_of_a_leap(mapper))
+
+    @property
+    def _has_moved(self) -> bool:
+        """True where the antenna stands elsewhere than was given."""
+        return self.lever is not None and self.lever.is_wrong
 
     def _take_clock(self, found: ReceiverClock | None) -> bool:
         """Give samples the times of a clock, None for that of the images; whether these are others than before."""

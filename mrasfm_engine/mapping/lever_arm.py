@@ -5,8 +5,9 @@ turns with the vehicle. On a straight way that shifts all positions alike. A tur
 looks like a scene of another length, by per cents of one with good positions; or it begins late or early, as if the
 clock were off.
 
-A place is taken to be right, as the manifest says, until it is more probable that it is wrong. Then it is three more
-unknowns of the adjustment (`ReceiverPositions.lever_m`), and the antenna stands where these say.
+A place is taken to be as well known as the manifest says, or exact, until it is more probable that it is wrong. Where
+it is not exact it is three more unknowns of the adjustment (`ReceiverPositions.lever_m`), and the antenna stands where
+these say.
 """
 
 from __future__ import annotations
@@ -32,17 +33,29 @@ _DIRECTIONS = (("ahead of", "behind"), ("to the left of", "to the right of"), ("
 class LeverArm:
     """Offset (3,) of the antenna from where it was given, in the rig's axes, and its sigmas (3,).
 
-    `log_odds` is the logarithm of the odds that it was given wrongly [Bayes' theorem].
+    Attributes
+    ----------
+    sigma_before_m
+        What was known of it before, along each axis; 0 where the place that was given is exact.
+    log_odds
+        Logarithm of the odds that it was given wrongly [Bayes' theorem].
     """
 
     offset_m: Floats
     sigma_m: Floats
+    sigma_before_m: float
     log_odds: float
 
     @staticmethod
     def unknown() -> LeverArm:
         """One of which positions have not been asked."""
-        return LeverArm(offset_m=np.zeros(AXES), sigma_m=np.full(AXES, SIGMA_OF_WRONG_M), log_odds=0.0)
+        known = {"offset_m": np.zeros(AXES), "sigma_m": np.full(AXES, SIGMA_OF_WRONG_M)}
+        return LeverArm(**known, sigma_before_m=SIGMA_OF_WRONG_M, log_odds=0.0)
+
+    @property
+    def varies(self) -> bool:
+        """True where it is estimated."""
+        return self.sigma_before_m > 0.0
 
     @property
     def is_wrong(self) -> bool:
@@ -56,7 +69,8 @@ class LeverArm:
 
     def is_as(self, other: LeverArm) -> bool:
         """True where both agree but for less than their sigmas can tell."""
-        return bool((np.abs(self.offset_m - other.offset_m) < STEADY_SIGMAS * self.sigma_m).all())
+        steady = np.abs(self.offset_m - other.offset_m) < STEADY_SIGMAS * self.sigma_m
+        return self.is_wrong == other.is_wrong and bool(steady.all())
 
 
 def lever_arm(
@@ -65,6 +79,7 @@ def lever_arm(
     positions: ReceiverPositions,
     *,
     assumed_m: Floats,
+    sigma_given_m: float = 0.0,
     factor: float = 1.0,
     sigma_factor: float = np.inf,
 ) -> tuple[LeverArm, Floats]:
@@ -78,6 +93,8 @@ def lever_arm(
         (n, 3, k), see `ways_of_antenna`.
     assumed_m
         Offset (3,) from where the antenna was given, at which it is taken to be there.
+    sigma_given_m
+        Of that place along each axis; 0 if it is exact unless it is wrong.
     factor, sigma_factor
         What is known without the receiver of the factor by which the places have to grow.
 
@@ -100,7 +117,7 @@ def lever_arm(
     prior = np.eye(AXES) / SIGMA_OF_WRONG_M**2
     step_m = np.linalg.solve(matrix + prior, right - prior @ assumed_m)
     noise = max(1.0, (left - float(right @ step_m)) / off_m.size)
-    result = _judged(matrix / noise, (right + matrix @ assumed_m) / noise)
+    result = _judged(matrix / noise, (right + matrix @ assumed_m) / noise, sigma_given_m)
     return result, np.concatenate([step_m, inverse @ (known[rest, -1] - known[rest, own] @ step_m)])
 
 
@@ -119,22 +136,35 @@ def ways_of_antenna(antenna_m: Floats, rotation: Floats, time_s: Floats, *, time
     return np.concatenate(ways, axis=2)
 
 
-def _judged(matrix: Floats, right: Floats) -> LeverArm:
-    """The lever arm by normal equations about where it was given, if offsets of wrong ones are normal."""
-    prior = np.eye(AXES) / SIGMA_OF_WRONG_M**2
-    posterior = matrix + prior
-    offset_m = np.asarray(np.linalg.solve(posterior, right), dtype=np.float64)
-    evidence = float(right @ offset_m) - float(np.linalg.slogdet(posterior)[1] - np.linalg.slogdet(prior)[1])
+def _judged(matrix: Floats, right: Floats, sigma_given_m: float) -> LeverArm:
+    """The lever arm by normal equations about where it was given; offsets are normal, of wrong ones and of others."""
+    evidence_of_wrong = _evidence(matrix, right, SIGMA_OF_WRONG_M)
+    log_odds = LOG_ODDS_BEFORE + evidence_of_wrong - _evidence(matrix, right, sigma_given_m)
+    sigma_m = SIGMA_OF_WRONG_M if log_odds > 0.0 else sigma_given_m
+    covariance = _posterior(matrix, sigma_m)
     return LeverArm(
-        offset_m=offset_m,
-        sigma_m=np.sqrt(np.diagonal(np.linalg.inv(posterior))),
-        log_odds=LOG_ODDS_BEFORE + 0.5 * evidence,
+        offset_m=covariance @ right,
+        sigma_m=np.sqrt(np.maximum(np.diagonal(covariance), 0.0)),
+        sigma_before_m=sigma_m,
+        log_odds=log_odds,
     )
 
 
+def _posterior(matrix: Floats, sigma_m: float) -> Floats:
+    """Covariance (3, 3) of offsets that have a standard deviation before positions say anything, which may be 0."""
+    variance = sigma_m**2
+    return np.asarray(variance * np.linalg.inv(np.eye(AXES) + variance * matrix), dtype=np.float64)
+
+
+def _evidence(matrix: Floats, right: Floats, sigma_m: float) -> float:
+    """Log likelihood of positions if offsets have this standard deviation, less that without an offset."""
+    determinant = float(np.linalg.slogdet(np.eye(AXES) + sigma_m**2 * matrix)[1])
+    return 0.5 * (float(right @ _posterior(matrix, sigma_m) @ right) - determinant)
+
+
 def lever_arm_findings(lever: LeverArm | None) -> list[Finding]:
-    """The finding that the antenna is elsewhere; none where it is taken to be where it was given."""
-    if lever is None:
+    """The finding that the antenna is elsewhere; none where it may be where it was given."""
+    if lever is None or not lever.is_wrong:
         return []
     clearest = int(np.argmax(np.abs(lever.offset_m) / lever.sigma_m))
     told = [

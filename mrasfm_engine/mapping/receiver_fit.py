@@ -14,7 +14,7 @@ from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.mapping.georeferencing import BENT, MOST, GnssAlignment, assess_residuals, similarity_motions
-from mrasfm_engine.mapping.lever_arm import SIGMA_OF_WRONG_M, LeverArm
+from mrasfm_engine.mapping.lever_arm import LeverArm
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.receiver_clock import SIGMA_OF_WRONG_CLOCK_S, ReceiverClock
 from mrasfm_engine.mapping.receiver_jumps import find_jumps, segment_of
@@ -76,7 +76,7 @@ class Placement:
     interval_us: float = 0.0  # of the receiver's samples
     track: GnssTrack | None = None  # the receiver's, where jumps of its error are looked for
     clock: ReceiverClock | None = None  # at which the track has its times; None where it is taken to be right
-    lever: LeverArm | None = None  # by which the lever arm is another one than was given; None where that is right
+    lever: LeverArm | None = None  # where the lever arm is estimated: by how much it is another one than was given
     noise_factor: float = 1.0  # by which residuals exceed their sigmas
     errors: ReceiverErrors = field(default_factory=ReceiverErrors)
     jumps: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))  # (k,) units from which on it is another
@@ -316,10 +316,10 @@ def clock_moves_m(mapper: Mapper, placement: Placement, units: Ints) -> Floats |
 
 
 def lever_moves_m(mapper: Mapper, placement: Placement, units: Ints) -> Floats | None:
-    """Ways (n, 3, 3) that positions at some units move if an antenna is off by a sigma; None where it is right."""
+    """Ways (n, 3, 3) that positions at some units move if the antenna is off by a sigma; None where it is exact."""
     if placement.lever is None:
         return None
-    result: Floats = SIGMA_OF_WRONG_M * mapper.state.unit_rotation[units]
+    result: Floats = placement.lever.sigma_before_m * mapper.state.unit_rotation[units]
     return result
 
 

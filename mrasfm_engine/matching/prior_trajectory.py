@@ -33,6 +33,7 @@ class PriorTrajectory:
     sigma: Floats | None = None  # (units, 6) of rotations about the world's axes (rad) and of positions (m)
     gnss: GnssTrack | None = None
     antenna_in_rig_m: Floats | None = None
+    sigma_antenna_m: float = 0.0  # 0: it is taken to be exact
     georeference: Georeference | None = None
     rough_world_from_rig: Floats | None = None  # (units, 4, 4)
     rough_world_from_local: Floats | None = None  # (4, 4)
@@ -60,6 +61,7 @@ def prior_trajectory(drive: Drive, config: GnssConfig, *, use_gnss: bool) -> Pri
         sigma=None if found is None else found.sigma,
         gnss=track,
         antenna_in_rig_m=antenna,
+        sigma_antenna_m=0.0 if gnss is None else gnss.sigma_antenna_m or 0.0,
         georeference=georeference,
         rough_world_from_rig=rough,
         rough_world_from_local=rough_world_from_local,

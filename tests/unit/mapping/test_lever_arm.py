@@ -50,12 +50,13 @@ def test_an_antenna_elsewhere_is_told_with_its_sign(offset_m: tuple[float, float
 def test_an_antenna_that_is_where_it_was_given_stays_there() -> None:
     found = found_by((0.0, 0.0, 0.0))
     assert not found.may_be_wrong
-    assert (np.abs(found.offset_m) < 4 * found.sigma_m).all()
+    assert not found.varies
+    np.testing.assert_array_equal(found.offset_m, np.zeros(3))
 
 
 def test_an_antenna_cannot_be_told_on_a_straight_way() -> None:
-    found = found_by((0.5, 0.8, 0.3), straight=True)
-    assert not found.is_wrong
+    assert not found_by((0.5, 0.8, 0.3), straight=True).is_wrong
+    found = found_by((0.5, 0.8, 0.3), straight=True, sigma_given_m=1.0)
     np.testing.assert_allclose(found.offset_m, 0.0, atol=0.05)
     np.testing.assert_allclose(found.sigma_m, 1.0, atol=0.05)
 
@@ -65,6 +66,26 @@ def test_a_scale_that_is_known_otherwise_tells_the_antenna_better() -> None:
     free, known = (found_by((0.0, 0.6, 0.0), white_m=0.3, sigma_factor=sigma) for sigma in (np.inf, 1e-4))
     assert known.sigma_m[1] < 0.8 * free.sigma_m[1]
     assert known.is_wrong
+
+
+@pytest.mark.parametrize("sigma_given_m", [0.05, 0.3, 2.0])
+def test_a_place_that_is_known_somewhat_is_estimated(sigma_given_m: float) -> None:
+    """It is as given where nothing else is said, and never less well known."""
+    right, off = (found_by((0.0, by_m, 0.0), sigma_given_m=sigma_given_m) for by_m in (0.0, sigma_given_m))
+    for found, by_m in ((right, 0.0), (off, sigma_given_m)):
+        assert found.varies
+        assert not found.is_wrong
+        assert found.offset_m[1] == pytest.approx(by_m, abs=4 * found.sigma_m[1])
+        assert (found.sigma_m <= sigma_given_m).all()
+    straight = found_by((0.0, 0.5, 0.0), straight=True, sigma_given_m=sigma_given_m)
+    np.testing.assert_allclose(straight.sigma_m, sigma_given_m, rtol=0.05)
+
+
+def test_a_place_that_is_known_well_may_be_wrong_all_the_same() -> None:
+    found = found_by((0.0, 0.9, 0.0), sigma_given_m=0.02)
+    assert found.is_wrong
+    assert found.sigma_before_m == 1.0
+    assert found.offset_m[1] == pytest.approx(0.9, abs=4 * found.sigma_m[1])
 
 
 def test_a_better_guess_leads_to_the_same_place() -> None:
@@ -107,11 +128,36 @@ def test_a_wrong_lever_arm_is_found_and_does_not_change_the_scene(wrong_by_m: tu
         assert "antenna" not in report
 
 
+def test_a_declared_sigma_makes_the_antenna_an_unknown() -> None:
+    """And what the scene's scale is uncertain by because of it is in its sigma."""
+    sigmas = []
+    for sigma_antenna_m in (0.0, 0.5):
+        simulated = make_simulated_drive(units=UNITS, cameras=2, points=2000)
+        mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
+        mapper.complete()
+        given_m = ARM_M + np.array([0.0, 0.3, 0.0])
+        track = received(simulated, 0.3)
+        known = AbsolutePriors(gnss=track, antenna_in_rig_m=given_m, sigma_antenna_m=sigma_antenna_m)
+        result = refine(mapper, known)
+        assert result.certainty is not None
+        assert result.placement is not None
+        assert [f.code for f in result.placement.findings] == []
+        report = describe_refinement(mapper, result)["gnss"]
+        assert ("antenna" in report) is (sigma_antenna_m > 0)
+        sigmas.append(result.certainty.sigma_scale)
+        scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
+    assert abs(scale - 1.0) < 3 * sigmas[1]
+    assert 1.1 * sigmas[0] < sigmas[1] < 0.1
+
+
 def test_the_finding_says_what_is_told() -> None:
-    lever = LeverArm(offset_m=np.array([-0.31, 0.72, 0.4]), sigma_m=np.array([0.05, 0.04, 0.97]), log_odds=9.0)
+    known = {"sigma_before_m": 1.0, "log_odds": 9.0}
+    lever = LeverArm(offset_m=np.array([-0.31, 0.72, 0.4]), sigma_m=np.array([0.05, 0.04, 0.97]), **known)
     (finding,) = lever_arm_findings(lever)
     assert "0.31 m behind (sigma 0.05 m) and 0.72 m to the left of (sigma 0.04 m) where" in finding.what
     assert "above" not in finding.what
-    unsure = LeverArm(offset_m=np.array([0.3, 2.9, 0.0]), sigma_m=np.array([0.7, 0.8, 0.99]), log_odds=2.0)
+    unsure = LeverArm(offset_m=np.array([0.3, 2.9, 0.0]), sigma_m=np.array([0.7, 0.8, 0.99]), **known)
     assert "is 2.90 m to the left of (sigma 0.80 m) where" in lever_arm_findings(unsure)[0].what
     assert lever_arm_findings(None) == []
+    as_given = LeverArm(offset_m=np.zeros(3), sigma_m=np.full(3, 0.1), sigma_before_m=0.2, log_odds=-3.0)
+    assert lever_arm_findings(as_given) == []

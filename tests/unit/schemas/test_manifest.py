@@ -248,6 +248,19 @@ def test_version_2_says_how_well_more_of_a_camera_is_known(example: dict[str, An
     assert set(new) == FIELDS_OF_VERSION_2
 
 
+def test_version_2_says_how_well_the_antenna_is_known(example: dict[str, Any]) -> None:
+    example["gnss"]["sigma_antenna_m"] = 0.2
+    with pytest.raises(DocumentError, match=r"gnss.sigma_antenna_m is of version 2 of the contract: set version to 2"):
+        parse_new_manifest(encoded(example))
+    example["version"] = 2
+    gnss = parse_new_manifest(encoded(example)).gnss
+    assert gnss is not None
+    assert gnss.sigma_antenna_m == 0.2
+    example["gnss"]["sigma_antenna_m"] = 0.0
+    with pytest.raises(DocumentError, match=r"^gnss.sigma_antenna_m: "):
+        parse_new_manifest(encoded(example))
+
+
 @pytest.mark.parametrize("vehicle", ["n015", "M-AB:1234", "7", "a" * 64])
 def test_version_2_names_the_vehicle(example: dict[str, Any], vehicle: str) -> None:
     assert parse_new_manifest(encoded(example)).vehicle is None
