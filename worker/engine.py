@@ -211,7 +211,13 @@ def _preflight(
         cancelled,
         request.content_sha256,
     )
-    findings = inspect_drive(run.drive, use_gnss=config.use_gnss, progress=run.step(Stage.PREFLIGHT), cancel=cancelled)
+    findings = inspect_drive(
+        run.drive,
+        use_gnss=config.use_gnss,
+        progress=run.step(Stage.PREFLIGHT),
+        cancel=cancelled,
+        content_sha256=run.content_sha256,
+    )
     if is_sound(findings):
         progress(Stage.CALIBRATION, 0, 1)
         try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import socket
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import count
@@ -133,6 +134,21 @@ def test_the_same_scene(make_cloud: Callable[..., World], brief_drive: Path, mon
     first, second = (summary_of(world, job) for world, job in jobs.items())
     assert first == second
     assert list(large.settings.scratch_dir.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_check_compares_no_contents(
+    make_cloud: Callable[..., World], long_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Copies among images are known from the digests of their uploads: images that are not sampled are read once."""
+    asked = list[str]()
+    brought = file_server._brought
+    monkeypatch.setattr(file_server, "_brought", lambda folder, file: asked.append(file) or brought(folder, file))
+    world = make_cloud(drive_room_bytes=1000)
+    _, check = world.add_unchecked_drive(long_drive)
+    checked = run(world, check)
+    assert checked.state == "SUCCEEDED", checked.problem
+    assert any(file.startswith("images/") and times == 1 for file, times in Counter(asked).items())
 
 
 @pytest.mark.slow
