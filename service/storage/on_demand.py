@@ -99,12 +99,12 @@ class OnDemandFolder:
         return self._files[name]
 
     def _make_room(self, size_bytes: int) -> None:
-        done = [name for name, future in self._files.items() if future.done()]
-        for name in done[: max(0, len(self._files) - _FEWEST)]:
-            if self._bytes + size_bytes <= self._room_bytes:
+        while self._bytes + size_bytes > self._room_bytes and len(self._files) > _FEWEST:
+            oldest = next((name for name, future in self._files.items() if future.done()), None)
+            if oldest is None:
                 return
-            self._forget(name)
-            (self._folder / name).unlink(missing_ok=True)
+            self._forget(oldest)
+            (self._folder / oldest).unlink(missing_ok=True)
 
     def _bring(self, name: str) -> None:
         try:
@@ -114,6 +114,8 @@ class OnDemandFolder:
                 self._forget(name)  # it may be asked for again
                 self._error = self._error or error
             raise
+        with self._lock:
+            self._files.move_to_end(name)  # who waits for it reads it now, however many others were asked for meanwhile
 
     def _forget(self, name: str) -> None:
         del self._files[name]

@@ -135,6 +135,35 @@ def test_threads_that_ask_for_the_same(make: Callable[..., OnDemandFolder], tmp_
     assert sorted(store.fetched) == NAMES
 
 
+def test_a_file_that_comes_late_stays(tmp_path: Path) -> None:
+    """Many others that were asked for while it came do not make it the next one to go."""
+    comes = threading.Event()
+
+    def fetch(key: str, target: Path) -> None:
+        assert key != REMOTE[NAMES[0]].key or comes.wait(60.0)
+        target.touch()
+
+    with OnDemandFolder(tmp_path, REMOTE, fetch=fetch, room_bytes=1) as folder, ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(folder.bring, NAMES[0])
+        for name in NAMES[100:400]:
+            folder.bring(name)
+        comes.set()
+        asked.result()
+        folder.bring(NAMES[500])
+        assert (tmp_path / NAMES[0]).exists()
+
+
+def test_many_files_that_are_here_take_no_time(tmp_path: Path) -> None:
+    """Millions of small images fit into the usual room."""
+    names = [f"{place}.png" for place in range(8000)]
+    files = {name: RemoteFile(name, 1) for name in names}
+    with OnDemandFolder(tmp_path, files, fetch=lambda key, target: None, room_bytes=10**9) as folder:
+        started = time.monotonic()
+        for name in names:
+            folder.bring(name)
+        assert time.monotonic() - started < 5.0
+
+
 def test_a_file_that_does_not_come(make: Callable[..., OnDemandFolder], tmp_path: Path) -> None:
     """Whoever asks hears of it, and may ask again; the error is kept for who has to answer for the attempt."""
     store = Store()
