@@ -30,7 +30,7 @@ class DriveCheckout:
     folder
         Holds `drive.json`.
     files
-        Images and masks under the names that the manifest gives them, in its order.
+        Images under the names that the manifest gives them, in its order, and then masks.
     content_sha256
         SHA-256 of all the drive's files by name, also of those that are not needed.
     """
@@ -97,9 +97,12 @@ def check_out(
 
 
 def _files_of_units(manifest: Path, units: range | None) -> dict[str, None]:
-    """Images and masks of some frames, or all, each once, in their order. The manifest was checked when it came."""
+    """Images of some frames, or all, in their order, and then their masks, each once.
+
+    The manifest was checked when it came.
+    """
     frames = json.loads(manifest.read_bytes())["frames"]
     frames = frames if units is None else frames[units.start : units.stop]
     images = [image for frame in frames for image in frame["images"].values()]
-    names = [name for image in images for name in (image["file"], image.get("mask")) if name is not None]
-    return dict.fromkeys(names)
+    names = [*(image["file"] for image in images), *(image.get("mask") for image in images)]
+    return dict.fromkeys(name for name in names if name is not None)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import contextvars
 import threading
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,7 +49,7 @@ class OnDemandFolder:
         self._folder, self._remote, self._fetch, self._room_bytes = folder, files, fetch, room_bytes
         self._order: Sequence[str] = list(files)
         self._place = {name: place for place, name in enumerate(self._order)}
-        self._last = -1  # place of the file that was asked for last
+        self._recent: deque[int] = deque(maxlen=_AHEAD)  # places of the files that were asked for last
         self._files: OrderedDict[str, Future[None]] = OrderedDict()  # those here, or on their way
         self._bytes = 0
         self._error: Exception | None = None
@@ -69,13 +69,10 @@ class OnDemandFolder:
             What `fetch` raises.
         """
         with self._lock:
-            place, last = self._place[name], self._last
-            self._last = place
             brought = self._begin(name)
             self._files.move_to_end(name)
-            if abs(place - last) <= _AHEAD:  # who asks goes along the files, and takes no samples
-                for other in self._beside(place):
-                    self._begin(other)
+            for other in self._expected(self._place[name]):
+                self._begin(other)
         brought.result()
 
     def raise_error(self) -> None:
@@ -83,12 +80,15 @@ class OnDemandFolder:
         if self._error is not None:
             raise self._error
 
-    def _beside(self, place: int) -> Iterator[str]:
-        """The next files in both directions, nearest first: those that were passed are here as yet."""
-        for step in range(1, _AHEAD + 1):
-            for other in (place + step, place - step):
-                if 0 <= other < len(self._order):
-                    yield self._order[other]
+    def _expected(self, place: int) -> Sequence[str]:
+        """The next files in either direction, as many as were asked for lately on the way to this place.
+
+        Who goes along the files soon has many brought ahead; who takes samples, few that nobody reads.
+        """
+        steps = [place - other for other in self._recent]
+        self._recent.append(place)
+        ahead, behind = (sum(0 < step * sign <= _AHEAD for step in steps) for sign in (1, -1))
+        return [*self._order[place + 1 : place + 1 + ahead], *self._order[max(0, place - behind) : place][::-1]]
 
     def _begin(self, name: str) -> Future[None]:
         if name not in self._files:

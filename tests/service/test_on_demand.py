@@ -117,6 +117,29 @@ def test_nothing_else_comes_for_samples(make: Callable[..., OnDemandFolder]) -> 
     assert sorted(store.fetched) == sorted(sampled)
 
 
+def test_little_else_comes_for_samples_of_units(make: Callable[..., OnDemandFolder]) -> None:
+    """All cameras of a unit are read, of which few units are."""
+    store = Store()
+    folder = make(store)
+    sampled = [NAMES[first + camera] for first in range(50, FILES, 100) for camera in range(6)]
+    for name in sampled:
+        folder.bring(name)
+    time.sleep(0.1)
+    assert set(sampled) <= set(store.fetched)
+    assert len(store.fetched) <= 2 * len(sampled)
+
+
+def test_images_come_ahead_between_readings_of_a_mask(make: Callable[..., OnDemandFolder]) -> None:
+    """One mask may serve all images of a camera."""
+    latency_s = 0.01
+    folder = make(Store(latency_s))
+    started = time.monotonic()
+    for name in NAMES[:200]:
+        folder.bring(name)
+        folder.bring(NAMES[-1])
+    assert time.monotonic() - started < 200 * latency_s / 2
+
+
 def test_threads_that_ask_for_the_same(make: Callable[..., OnDemandFolder], tmp_path: Path) -> None:
     store = Store(0.002)
     folder = make(store, room_bytes=300 * SIZE_BYTES)

@@ -16,6 +16,7 @@ from sqlalchemy import select
 
 from mrasfm_engine.errors import StorageError
 from service.database.tables import Blob, DriveFile, Job, SceneFile
+from service.domain.drive_checkout import check_out
 from service.storage.on_demand import OnDemandFolder, RemoteFile
 from tests.helpers.s3_server import s3_server, settings_of_bucket
 from tests.helpers.service_world import World
@@ -185,6 +186,15 @@ def test_a_store_that_loses_a_file(make_cloud: Callable[..., World], brief_drive
     assert job.state == "FAILED"
     assert job.problem is not None
     assert "storage" in job.problem["type"], job.problem
+
+
+def test_a_pass_over_masks_meets_no_images(make_world: Callable[..., World], long_drive: Path, tmp_path: Path) -> None:
+    """Files that are read in one pass follow one another, as those are brought ahead that come next."""
+    world = make_world()
+    drive_id = world.add_drive(long_drive)
+    drive = check_out(world.database, drive_id, tmp_path / "drive", fetch=world.artifacts.fetch)
+    folders = [name.partition("/")[0] for name in drive.files]
+    assert folders == ["images"] * 82 + ["masks"] * 82
 
 
 def test_a_folder_store_lays_all_out(
