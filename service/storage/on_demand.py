@@ -10,7 +10,7 @@ import contextvars
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -20,6 +20,7 @@ from service.storage.transfers import FETCHES
 
 _AHEAD = 2 * FETCHES  # files that are brought before they are asked for
 _FEWEST = 4 * _AHEAD  # that stay, whatever their size: one that was asked for is read before so many others come
+_ENDS_WITHIN_S = 2.0  # a store that hangs holds up neither a stop nor what follows
 
 
 @dataclass(frozen=True)
@@ -73,10 +74,15 @@ class OnDemandFolder:
             self._files.move_to_end(name)
             for other in self._expected(self._place[name]):
                 self._begin(other)
-        brought.result()
+        try:
+            brought.result()
+        except Exception as error:
+            if not brought.cancelled():
+                self._error = self._error or error
+            raise
 
     def raise_error(self) -> None:
-        """Raise the first error of a file that did not come, if there was one."""
+        """Raise the first error of a file that was asked for and did not come, if there was one."""
         if self._error is not None:
             raise self._error
 
@@ -109,10 +115,9 @@ class OnDemandFolder:
     def _bring(self, name: str) -> None:
         try:
             self._fetch(self._remote[name].key, self._folder / name)
-        except Exception as error:
+        except Exception:
             with self._lock:
                 self._forget(name)  # it may be asked for again
-                self._error = self._error or error
             raise
         with self._lock:
             self._files.move_to_end(name)  # who waits for it reads it now, however many others were asked for meanwhile
@@ -125,4 +130,7 @@ class OnDemandFolder:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            under_way = [future for future in self._files.values() if not future.cancelled()]
+        wait(under_way, _ENDS_WITHIN_S)

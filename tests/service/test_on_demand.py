@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -199,6 +199,33 @@ def test_a_file_that_does_not_come(make: Callable[..., OnDemandFolder], tmp_path
     store.broken = set()
     folder.bring(NAMES[300])
     assert (tmp_path / "drive" / NAMES[300]).exists()
+
+
+def test_a_file_that_nobody_asks_for(make: Callable[..., OnDemandFolder]) -> None:
+    """It is brought ahead of who might ask, and fails nothing if it does not come."""
+    store = Store()
+    store.broken = {NAMES[20]}
+    folder = make(store)
+    for name in NAMES[:20]:
+        folder.bring(name)
+    time.sleep(0.1)
+    assert NAMES[20] in store.fetched
+    folder.raise_error()
+
+
+def test_a_store_that_hangs_holds_up_no_end(tmp_path: Path) -> None:
+    """And who waits for a file hears of the end, which is no error of the store."""
+    hangs = threading.Event()
+    folder = OnDemandFolder(tmp_path, REMOTE, fetch=lambda key, target: hangs.wait(30.0) and None, room_bytes=10**9)
+    with ThreadPoolExecutor(40) as pool:
+        asked = [pool.submit(folder.bring, name) for name in NAMES[::15]]
+        started = time.monotonic()
+        with folder:
+            time.sleep(0.2)
+        assert time.monotonic() - started < 10.0
+        hangs.set()
+        assert {type(one.exception()) for one in asked} == {type(None), CancelledError}
+    folder.raise_error()
 
 
 def test_a_file_that_the_drive_does_not_have(make: Callable[..., OnDemandFolder]) -> None:
