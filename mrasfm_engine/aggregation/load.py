@@ -258,7 +258,7 @@ def _with_receiver(folder: Path, manifest: DriveManifest, report: dict[str, Any]
             return manifest
         gnss = dict(manifest.gnss)
         if "antenna" in found[-1]:
-            gnss["antenna_in_rig_m"] = found[-1]["antenna"]["in_rig_m"]
+            gnss["antenna_in_rig_m"] = found[-1]["antenna"]["used_in_rig_m"]
         if "clock_offset_s" in found[-1]:
             late_us = round(float(found[-1]["clock_offset_s"]) * 1e6)
             samples = [dict(sample) | {"timestamp_us": sample.timestamp_us + late_us} for sample in gnss["samples"]]

@@ -68,6 +68,7 @@ class AbsolutePriors:
     placed_by_rough_poses: bool = False
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
     lever: LeverArm | None = None  # where the lever arm is estimated: by how much it is another one than was given
+    doubted_lever: LeverArm | None = None  # where it is not: what it more probably is
     clock_leap: ClockLeap | None = None  # of that clock, behind or before which positions take no part
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
@@ -108,7 +109,7 @@ class AbsolutePriors:
         `sigma_scale`, relative, is what the images leave open of it. See `place_by_gnss` for `rig_may_be_wrong`.
         """
         settings = mapper.config.bundle_adjustment
-        self.placed_by_rough_poses = False
+        self.placed_by_rough_poses, self.doubted_lever = False, None
         if settings.priors and settings.reassessment and not mapper.drive.has_single_camera:
             scale_with_baselines(mapper, scale_of_baselines(mapper)[0])
         self._place_by_gnss(mapper, sigma_scale=sigma_scale, rig_may_be_wrong=rig_may_be_wrong)
@@ -199,27 +200,21 @@ class AbsolutePriors:
             self._renew_rough(mapper)
 
     def _set_receiver(self, mapper: Mapper) -> bool:
-        """Give samples the times, and the antenna the place, that positions show; whether these are others than before.
+        """Give samples the times that positions show, and the antenna the place; whether these are others than before.
 
-        Where an error of either would explain them alone, it is the one that is more probable: what it leaves shows
-        whether there is another.
+        The antenna's place is one that the manifest knows so well only.
         """
         if self.placement is None or self.placement.prior is None or self.gnss is None:
             return False
         clock = None if self.clock_varies else find_clock(mapper, self.placement)
         clock = clock if clock is not None and clock.is_wrong else None
         lever = find_lever_arm(mapper, self.placement, sigma_given_m=self.sigma_antenna_m, times_vary=self.clock_varies)
-        lever = lever if lever is not None and lever.varies else None
-        if clock is not None and lever is not None and self.clock is None and lever.is_wrong and not self._has_moved:
-            clock, lever = (clock, self.lever) if clock.log_odds >= lever.log_odds else (None, lever)
         is_other = False if self.clock_varies else self._take_clock(clock)
-        is_other |= self._take_lever_arm(lever)
+        if self.sigma_antenna_m > 0.0:
+            is_other |= self._take_lever_arm(lever)
+        elif lever is not None and lever.is_wrong and clock is None:  # of a clock that is off the rest is next to tell
+            self.doubted_lever = lever
         return is_other or (clock is not None and self._leave_a_side_of_a_leap(mapper))
-
-    @property
-    def _has_moved(self) -> bool:
-        """True where the antenna stands elsewhere than was given."""
-        return self.lever is not None and self.lever.is_wrong
 
     def _take_clock(self, found: ReceiverClock | None) -> bool:
         """Give samples the times of a clock, None for that of the images; whether these are others than before."""

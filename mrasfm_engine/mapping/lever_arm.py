@@ -5,9 +5,10 @@ turns with the vehicle. On a straight way that shifts all positions alike. A tur
 looks like a scene of another length, by per cents of one with good positions; or it begins late or early, as if the
 clock were off.
 
-A place is taken to be as well known as the manifest says, or exact, until it is more probable that it is wrong. Where
-it is not exact it is three more unknowns of the adjustment (`ReceiverPositions.lever_m`), and the antenna stands where
-these say.
+Where the manifest says how well the place is known, it is three more unknowns of the adjustment
+(`ReceiverPositions.lever_m`), and the antenna stands where these say. Without that it stays where it was given, as a
+scene that bends by a thousandth can look the same: that it is more probably elsewhere is a finding, and what the length
+of the scene would change by is in its sigma.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from schemas.findings import Finding, warning
 # what is between one point and another of a car.
 WRONG_SHARE, SIGMA_OF_WRONG_M = 0.05, 1.0
 LOG_ODDS_BEFORE = float(np.log(WRONG_SHARE / (1.0 - WRONG_SHARE)))
+SIGMA_TURNS = 0.01  # of the angle of a turn as images show it, relative: lenses are known to about that
+_TURNS = AXES + 5  # among the ways of an antenna, behind growth, shifts and a turn of all
 _TOLD = 0.5  # of that sigma, below which positions tell where the antenna is along an axis
 _DIRECTIONS = (("ahead of", "behind"), ("to the left of", "to the right of"), ("above", "below"))
 
@@ -39,18 +42,21 @@ class LeverArm:
         What was known of it before, along each axis; 0 where the place that was given is exact.
     log_odds
         Logarithm of the odds that it was given wrongly [Bayes' theorem].
+    longer
+        By which a scene that has the positions' length is longer with the antenna there, relative.
     """
 
     offset_m: Floats
     sigma_m: Floats
     sigma_before_m: float
     log_odds: float
+    longer: float = 0.0
 
     @staticmethod
     def unknown() -> LeverArm:
         """One of which positions have not been asked."""
-        known = {"offset_m": np.zeros(AXES), "sigma_m": np.full(AXES, SIGMA_OF_WRONG_M)}
-        return LeverArm(**known, sigma_before_m=SIGMA_OF_WRONG_M, log_odds=0.0)
+        sigma_m = SIGMA_OF_WRONG_M
+        return LeverArm(offset_m=np.zeros(AXES), sigma_m=np.full(AXES, sigma_m), sigma_before_m=sigma_m, log_odds=0.0)
 
     @property
     def varies(self) -> bool:
@@ -107,6 +113,7 @@ def lever_arm(
     known = normal_equations(
         off_m, replace(positions, lever_m=None), ways, grows=AXES, factor=factor, sigma_factor=sigma_factor
     )
+    known[_TURNS, _TURNS] += SIGMA_TURNS**-2
     own, rest = slice(0, AXES), slice(AXES, -1)
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known)[rest], 1e-12))
     scale = np.outer(scale, scale)
@@ -132,8 +139,16 @@ def ways_of_antenna(antenna_m: Floats, rotation: Floats, time_s: Floats, *, time
         Whether all images may have been taken earlier or later, too.
     """
     by_time, others = np.split(track_motions(antenna_m, time_s), [1], axis=2)
-    ways = [rotation, others, by_time] if times_vary else [rotation, others]
-    return np.concatenate(ways, axis=2)
+    ways = [rotation, others, _by_turning_more(antenna_m, rotation)]
+    return np.concatenate([*ways, by_time] if times_vary else ways, axis=2)
+
+
+def _by_turning_more(antenna_m: Floats, rotation: Floats) -> Floats:
+    """The way (n, 3, 1) of places if each turn of the vehicle is wider by all of itself."""
+    heading = np.unwrap(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+    steps_m, at = np.diff(antenna_m, axis=0), 0.5 * (heading[1:] + heading[:-1]) - heading.mean()
+    aside_m = at[:, None] * np.stack([-steps_m[:, 1], steps_m[:, 0], np.zeros(len(at))], axis=1)
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(aside_m, axis=0)])[:, :, None]
 
 
 def _judged(matrix: Floats, right: Floats, sigma_given_m: float) -> LeverArm:
@@ -162,10 +177,19 @@ def _evidence(matrix: Floats, right: Floats, sigma_m: float) -> float:
     return 0.5 * (float(right @ _posterior(matrix, sigma_m) @ right) - determinant)
 
 
-def lever_arm_findings(lever: LeverArm | None) -> list[Finding]:
-    """The finding that the antenna is elsewhere; none where it may be where it was given."""
+def lever_arm_findings(lever: LeverArm | None, *, is_taken: bool) -> list[Finding]:
+    """The finding that the antenna is elsewhere; none where it may be where it was given.
+
+    `is_taken` says that the scene takes it to be there.
+    """
     if lever is None or not lever.is_wrong:
         return []
+    if is_taken:
+        then, declare = "the scene takes it to be there", ""
+    else:
+        longer = "longer" if lever.longer > 0 else "shorter"
+        then = f"the scene leaves it where it was given, and would be {abs(lever.longer):.1%} {longer} with it there"
+        declare = " With gnss.sigma_antenna_m its place is estimated with the scene."
     clearest = int(np.argmax(np.abs(lever.offset_m) / lever.sigma_m))
     told = [
         f"{abs(off_m):.2f} m {names[0 if off_m > 0 else 1]} (sigma {sigma_m:.2f} m)"
@@ -175,9 +199,8 @@ def lever_arm_findings(lever: LeverArm | None) -> list[Finding]:
     return [
         warning(
             "antenna-position",
-            f"by the shape of the way, the antenna is {' and '.join(told)} where gnss.antenna_in_rig_m says: the scene "
-            "takes it to be there",
+            f"by the shape of the way, the antenna is {' and '.join(told)} where gnss.antenna_in_rig_m says: {then}",
             "Check gnss.antenna_in_rig_m: its signs, its axes (rig.body_axes), and that it begins at the rig's origin, "
-            "from which rig_from_cam is given.",
+            f"from which rig_from_cam is given.{declare}",
         )
     ]

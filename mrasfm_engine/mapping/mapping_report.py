@@ -281,11 +281,12 @@ def describe_refinement(mapper: Mapper, refinement: Refinement) -> dict[str, Any
         if placement.clock is not None:
             clock = {"clock_offset_s": placement.clock.offset_s, "sigma_clock_offset_s": placement.clock.sigma_s}
             result["gnss"] |= clock
-        if placement.lever is not None:
+        lever = placement.lever or refinement.absolute.doubted_lever
+        if lever is not None:
             result["gnss"]["antenna"] = {
-                "in_rig_m": placement.lever_arm_m.tolist(),
-                "offset_m": placement.lever.offset_m.tolist(),
-                "sigma_m": placement.lever.sigma_m.tolist(),
+                "used_in_rig_m": placement.lever_arm_m.tolist(),
+                "offset_m": lever.offset_m.tolist(),
+                "sigma_m": lever.sigma_m.tolist(),
             }
     elif placement is not None:
         result["gnss"] = {"not_used": placement.reason}

@@ -376,7 +376,7 @@ def _scale_by_positions(mapper: Mapper, placement: Placement) -> float:
     return (1.0 + growth) / scale_of_baselines(mapper)[0]
 
 
-def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
+def compare_with_rig(mapper: Mapper, placement: Placement, doubted: LeverArm | None = None) -> Placement:
     """Say by the refined scene what positions make of the rig's lengths as given, and find where they contradict it.
 
     The receiver's clock or antenna, which would explain another length, is a finding of its own. While cameras were
@@ -385,10 +385,10 @@ def compare_with_rig(mapper: Mapper, placement: Placement) -> Placement:
     """
     if placement.prior is None:
         return placement
-    placement = replace(
-        placement,
-        findings=[*placement.findings, *clock_findings(placement.clock), *lever_arm_findings(placement.lever)],
-    )
+    of_antenna = [
+        *lever_arm_findings(placement.lever, is_taken=True), *lever_arm_findings(doubted, is_taken=False)
+    ]  # fmt: skip
+    placement = replace(placement, findings=[*placement.findings, *clock_findings(placement.clock), *of_antenna])
     if mapper.drive.has_single_camera:
         return placement
     scale = (1.0 + _growth_by_term(mapper, placement)) / scale_of_baselines(mapper)[0]

@@ -94,7 +94,10 @@ def refine(
     take_most_likely_size(mapper, result, free_units, cancel=cancel)
     _assess(mapper, result, free_units, cancel)
     if result.placement is not None:
-        result.absolute.placement = compare_with_rig(mapper, result.placement)
+        doubted = result.absolute.doubted_lever
+        result.absolute.placement = compare_with_rig(mapper, result.placement, doubted)
+        if doubted is not None and result.certainty is not None:
+            result.certainty = result.certainty.with_scale_error(abs(doubted.longer))
     if progress is not None:
         progress(ROUNDS + 1, ROUNDS + 1)
     return result

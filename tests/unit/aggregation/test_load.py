@@ -66,7 +66,7 @@ def test_the_receiver_is_as_the_scene_found_it(tmp_path: Path) -> None:
         example,
         drive=replace(example.drive, manifest=example.drive.manifest.model_copy(update={"gnss": gnss})),
     )
-    found = {"antenna": {"in_rig_m": [0.5, -0.3, 1.7]}, "clock_offset_s": -0.25}
+    found = {"antenna": {"used_in_rig_m": [0.5, -0.3, 1.7]}, "clock_offset_s": -0.25}
     stages = [{"stage": "mapping"}, {"stage": "refinement", "gnss": found}]
     write_scene(example, tmp_path / "scene", {"settings": {"features": {"extractor": "sift"}}, "stages": stages})
     read = read_scene(tmp_path / "scene", "one").manifest.gnss
@@ -74,7 +74,7 @@ def test_the_receiver_is_as_the_scene_found_it(tmp_path: Path) -> None:
     assert list(read.antenna_in_rig_m) == [0.5, -0.3, 1.7]
     assert [sample.timestamp_us for sample in read.samples] == [750_000, 1_750_000, 2_750_000]
     report = json.loads((tmp_path / "scene" / "report.json").read_text())
-    report["stages"][1]["gnss"]["antenna"]["in_rig_m"] = [1e9, 0.0, 0.0]
+    report["stages"][1]["gnss"]["antenna"]["used_in_rig_m"] = [1e9, 0.0, 0.0]
     (tmp_path / "scene" / "report.json").write_text(json.dumps(report))
     with pytest.raises(InputError, match=r"scene one: .*report.json is damaged"):
         read_scene(tmp_path / "scene", "one")

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -11,6 +15,7 @@ from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.lever_arm import LeverArm, lever_arm, lever_arm_findings, ways_of_antenna
 from mrasfm_engine.mapping.mapping_report import describe_refinement
 from mrasfm_engine.mapping.refinement import refine
+from mrasfm_engine.mapping.refinement_result import Refinement
 from tests.helpers.simulated_drive import make_model, make_simulated_drive, with_true_poses
 from tests.unit.mapping.test_placement import ARM_M, received
 from tests.unit.mapping.test_receiver_clock import UNITS, measured
@@ -76,7 +81,7 @@ def test_a_place_that_is_known_somewhat_is_estimated(sigma_given_m: float) -> No
         assert found.varies
         assert not found.is_wrong
         assert found.offset_m[1] == pytest.approx(by_m, abs=4 * found.sigma_m[1])
-        assert (found.sigma_m <= sigma_given_m).all()
+        assert (found.sigma_m <= sigma_given_m * (1.0 + 1e-9)).all()
     straight = found_by((0.0, 0.5, 0.0), straight=True, sigma_given_m=sigma_given_m)
     np.testing.assert_allclose(straight.sigma_m, sigma_given_m, rtol=0.05)
 
@@ -105,27 +110,52 @@ def test_a_better_guess_leads_to_the_same_place() -> None:
     assert not found[0].is_as(LeverArm.unknown())
 
 
-@pytest.mark.parametrize("wrong_by_m", [(0.0, 0.0, 0.0), (0.0, 0.9, 0.0), (-0.8, -0.4, 0.0)])
-def test_a_wrong_lever_arm_is_found_and_does_not_change_the_scene(wrong_by_m: tuple[float, float, float]) -> None:
+def refined(wrong_by_m: Sequence[float], sigma_antenna_m: float) -> tuple[Refinement, dict[str, Any], float]:
+    """A drive through a bend whose antenna is given wrongly; what the report says of it, and the scale's error."""
     simulated = make_simulated_drive(units=UNITS, cameras=2, points=2000)
     mapper = with_true_poses(make_model(simulated), simulated, range(UNITS))
     mapper.complete()
-    given_m = ARM_M + wrong_by_m
-    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.02), antenna_in_rig_m=given_m))
-    assert result.placement is not None
-    assert result.certainty is not None
-    assert [f.code for f in result.placement.findings] == (["antenna-position"] if any(wrong_by_m) else [])
+    given_m, track = ARM_M + np.array(wrong_by_m), received(simulated, 0.02)
+    result = refine(mapper, AbsolutePriors(gnss=track, antenna_in_rig_m=given_m, sigma_antenna_m=sigma_antenna_m))
     scale = align_similarity(mapper.state.unit_position_m, simulated.world_from_rig[:, :3, 3]).scale
-    assert abs(scale - 1.0) < 3 * result.certainty.sigma_scale
-    assert 1e-5 < result.certainty.sigma_scale < 0.01
-    report = describe_refinement(mapper, result)["gnss"]
-    if any(wrong_by_m):
-        sigma_m = np.array(report["antenna"]["sigma_m"])
-        np.testing.assert_allclose(report["antenna"]["in_rig_m"][:2], ARM_M[:2], atol=4 * sigma_m[:2].max())
-        np.testing.assert_allclose(np.add(given_m, report["antenna"]["offset_m"]), report["antenna"]["in_rig_m"])
-        assert sigma_m[:2].max() < 0.2
-    else:
+    return result, describe_refinement(mapper, result)["gnss"], scale - 1.0
+
+
+def codes(result: Refinement) -> list[str]:
+    assert result.placement is not None
+    return [finding.code for finding in result.placement.findings]
+
+
+@pytest.mark.parametrize("wrong_by_m", [(0.0, 0.0, 0.0), (0.0, 0.9, 0.0), (0.0, -0.9, 0.0)])
+def test_a_wrong_lever_arm_is_said_to_be_wrong(wrong_by_m: tuple[float, float, float]) -> None:
+    """The scene leaves it as it is, and its scale is as uncertain as that makes it."""
+    result, report, scale_error = refined(wrong_by_m, 0.0)
+    assert result.certainty is not None
+    assert abs(scale_error) < 3 * result.certainty.sigma_scale
+    if not any(wrong_by_m):
+        assert codes(result) == []
         assert "antenna" not in report
+        assert result.certainty.sigma_scale < 0.005
+        return
+    assert codes(result) == ["antenna-position"]
+    np.testing.assert_allclose(report["antenna"]["used_in_rig_m"], ARM_M + wrong_by_m)
+    sigma_m = np.array(report["antenna"]["sigma_m"])
+    np.testing.assert_allclose(report["antenna"]["offset_m"][:2], -np.array(wrong_by_m)[:2], atol=4 * sigma_m[:2].max())
+    assert sigma_m[:2].max() < 0.3
+    assert 0.5 * abs(scale_error) < result.certainty.sigma_scale < 0.1
+
+
+@pytest.mark.parametrize("wrong_by_m", [(0.0, 0.9, 0.0), (-0.8, -0.4, 0.0)])
+def test_a_lever_arm_of_which_little_is_known_is_estimated(wrong_by_m: tuple[float, float, float]) -> None:
+    result, report, scale_error = refined(wrong_by_m, 0.5)
+    assert result.certainty is not None
+    assert abs(scale_error) < 3 * result.certainty.sigma_scale
+    assert 1e-5 < result.certainty.sigma_scale < 0.01
+    sigma_m = np.array(report["antenna"]["sigma_m"])
+    np.testing.assert_allclose(report["antenna"]["used_in_rig_m"][:2], ARM_M[:2], atol=4 * sigma_m[:2].max())
+    given_m = ARM_M + wrong_by_m
+    np.testing.assert_allclose(np.add(given_m, report["antenna"]["offset_m"]), report["antenna"]["used_in_rig_m"])
+    assert sigma_m[:2].max() < 0.2
 
 
 def test_a_declared_sigma_makes_the_antenna_an_unknown() -> None:
@@ -153,11 +183,14 @@ def test_a_declared_sigma_makes_the_antenna_an_unknown() -> None:
 def test_the_finding_says_what_is_told() -> None:
     known = {"sigma_before_m": 1.0, "log_odds": 9.0}
     lever = LeverArm(offset_m=np.array([-0.31, 0.72, 0.4]), sigma_m=np.array([0.05, 0.04, 0.97]), **known)
-    (finding,) = lever_arm_findings(lever)
+    (finding,) = lever_arm_findings(lever, is_taken=True)
     assert "0.31 m behind (sigma 0.05 m) and 0.72 m to the left of (sigma 0.04 m) where" in finding.what
     assert "above" not in finding.what
+    (left,) = lever_arm_findings(replace(lever, longer=-0.0213), is_taken=False)
+    assert "the scene leaves it where it was given, and would be 2.1% shorter with it there" in left.what
+    assert "gnss.sigma_antenna_m" in left.remedy
     unsure = LeverArm(offset_m=np.array([0.3, 2.9, 0.0]), sigma_m=np.array([0.7, 0.8, 0.99]), **known)
-    assert "is 2.90 m to the left of (sigma 0.80 m) where" in lever_arm_findings(unsure)[0].what
-    assert lever_arm_findings(None) == []
+    assert "is 2.90 m to the left of (sigma 0.80 m) where" in lever_arm_findings(unsure, is_taken=True)[0].what
+    assert lever_arm_findings(None, is_taken=True) == []
     as_given = LeverArm(offset_m=np.zeros(3), sigma_m=np.full(3, 0.1), sigma_before_m=0.2, log_odds=-3.0)
-    assert lever_arm_findings(as_given) == []
+    assert lever_arm_findings(as_given, is_taken=True) == []
