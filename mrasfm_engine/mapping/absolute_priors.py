@@ -202,7 +202,7 @@ class AbsolutePriors:
     def _set_receiver(self, mapper: Mapper) -> bool:
         """Give samples the times that positions show, and the antenna the place; whether these are others than before.
 
-        The antenna's place is one that the manifest knows so well only.
+        Where the manifest does not leave the antenna's place open, that it is more probably another is noted.
         """
         if self.placement is None or self.placement.prior is None or self.gnss is None:
             return False
@@ -212,7 +212,7 @@ class AbsolutePriors:
         is_other = False if self.clock_varies else self._take_clock(clock)
         if self.sigma_antenna_m > 0.0:
             is_other |= self._take_lever_arm(lever)
-        elif lever is not None and lever.is_wrong and clock is None:  # of a clock that is off the rest is next to tell
+        elif lever is not None and lever.is_wrong and clock is None:  # a clock that is off looks much the same
             self.doubted_lever = lever
         return is_other or (clock is not None and self._leave_a_side_of_a_leap(mapper))
 
