@@ -180,6 +180,7 @@ export interface components {
         Gnss: {
             height_datum: string;
             antenna_in_rig_m: number[];
+            sigma_antenna_m?: number | null;
             samples: components["schemas"]["GnssSample"][];
         };
         GnssSample: {
