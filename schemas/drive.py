@@ -307,8 +307,8 @@ class Gnss(_Model):
     antenna_in_rig_m: Vector3 = Field(description="position of the antenna in the rig frame (lever arm)")
     sigma_antenna_m: Sigma | None = Field(
         None,
-        description="since version 2: how well it is known, per axis; without it, it is exact until positions "
-        "contradict that",
+        description="since version 2: how well it is known, per axis, with which it is estimated; without it, it is "
+        "taken to be exact",
     )
     samples: Annotated[list[GnssSample], Field(max_length=MAX_GNSS_SAMPLES), FailFast()] = Field(
         description="in order of time; they need not coincide with frames"

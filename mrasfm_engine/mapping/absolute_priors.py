@@ -25,7 +25,7 @@ from mrasfm_engine.mapping.placement import (
     reassess_positions,
 )
 from mrasfm_engine.mapping.receiver_clock import ReceiverClock
-from mrasfm_engine.mapping.receiver_faults import find_clock, find_lever_arm
+from mrasfm_engine.mapping.receiver_faults import find_clock, find_lever_arm, with_length
 from mrasfm_engine.mapping.receiver_fit import Placement, ReceiverErrors
 from mrasfm_engine.mapping.rough_placement import compare_rough_poses, place_by_rough_poses, shape_fault
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
@@ -213,7 +213,7 @@ class AbsolutePriors:
         if self.sigma_antenna_m > 0.0:
             is_other |= self._take_lever_arm(lever)
         elif lever is not None and lever.is_wrong and clock is None:  # a clock that is off looks much the same
-            self.doubted_lever = lever
+            self.doubted_lever = with_length(mapper, self.placement, lever)
         return is_other or (clock is not None and self._leave_a_side_of_a_leap(mapper))
 
     def _take_clock(self, found: ReceiverClock | None) -> bool:

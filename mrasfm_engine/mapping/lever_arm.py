@@ -59,11 +59,6 @@ class LeverArm:
         return LeverArm(offset_m=np.zeros(AXES), sigma_m=np.full(AXES, sigma_m), sigma_before_m=sigma_m, log_odds=0.0)
 
     @property
-    def varies(self) -> bool:
-        """True where it is estimated."""
-        return self.sigma_before_m > 0.0
-
-    @property
     def is_wrong(self) -> bool:
         """True where it is more probable that the antenna is elsewhere than that it is where it was given."""
         return self.log_odds > 0.0

@@ -406,6 +406,10 @@ def _growth_by_term(mapper: Mapper, placement: Placement) -> float:
     positions = placement.prior
     assert positions is not None
     antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
-    off_m = (positions.position_m - antenna_m)[:, :, None]
-    known = positions.information(np.concatenate([similarity_motions(antenna_m), off_m], axis=2))
+    return growth_by_positions(positions, antenna_m, positions.position_m - antenna_m)
+
+
+def growth_by_positions(positions: ReceiverPositions, antenna_m: Floats, off_m: Floats) -> float:
+    """Growth, relative, that explains most of what positions are off (n, 3) the antenna's places (n, 3)."""
+    known = positions.information(np.concatenate([similarity_motions(antenna_m), off_m[:, :, None]], axis=2))
     return float(np.linalg.lstsq(known[:-1, :-1], known[:-1, -1], rcond=1e-12)[0][-1])

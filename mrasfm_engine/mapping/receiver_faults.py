@@ -8,10 +8,15 @@ import numpy as np
 
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.mapping.calibration import scale_of_baselines
-from mrasfm_engine.mapping.georeferencing import assess_residuals, similarity_motions
+from mrasfm_engine.mapping.georeferencing import assess_residuals
 from mrasfm_engine.mapping.lever_arm import LeverArm, lever_arm, ways_of_antenna
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.placement import beside_a_bent_scene, positions_with_errors, with_prior
+from mrasfm_engine.mapping.placement import (
+    beside_a_bent_scene,
+    growth_by_positions,
+    positions_with_errors,
+    with_prior,
+)
 from mrasfm_engine.mapping.receiver_clock import MIN_POSITIONS_FOR_CLOCK, ReceiverClock, clock_offset
 from mrasfm_engine.mapping.receiver_fit import Placement, antenna_places_m, most_likely_errors
 from mrasfm_engine.types import Floats
@@ -77,27 +82,25 @@ def find_lever_arm(mapper: Mapper, placement: Placement, *, sigma_given_m: float
     result, sizes = found(placement, off_m)
     is_known = placement.lever is not None and placement.lever.is_wrong
     if is_known or not result.may_be_wrong:
-        return _with_length(result, placement, antenna_m, ways)
+        return result
     left_m = ways @ sizes - off_m
     inlier, factor = assess_residuals(
         left_m, placement.known_sigma_m[units], placement.inlier, outlier_sigmas=mapper.config.gnss.outlier_sigmas
     )
     if inlier.sum() < MIN_POSITIONS_FOR_CLOCK:
-        return _with_length(result, placement, antenna_m, ways)
+        return result
     judged = replace(placement, lever=LeverArm.unknown(), off_m=left_m, inlier=inlier, noise_factor=factor)
     judged = replace(judged, errors=most_likely_errors(mapper, judged, clock_varies=times_vary))
-    return _with_length(found(judged, off_m)[0], placement, antenna_m, ways)
+    return found(judged, off_m)[0]
 
 
-def _with_length(lever: LeverArm, placement: Placement, antenna_m: Floats, ways: Floats) -> LeverArm:
-    """The lever arm with what it makes of the length of a scene that lies as positions say, at places (n, 3)."""
+def with_length(mapper: Mapper, placement: Placement, lever: LeverArm) -> LeverArm:
+    """The lever arm with what it makes of the length of a scene that lies as positions say."""
     positions = placement.prior
     assert positions is not None
-    rows = np.flatnonzero(placement.inlier)
-    moved_m = (ways[rows, :, :3] @ lever.offset_m)[:, :, None]
-    known = positions.information(np.concatenate([similarity_motions(antenna_m[rows]), moved_m], axis=2))
-    grows = np.linalg.lstsq(known[:-1, :-1], known[:-1, -1], rcond=1e-12)[0][-1]
-    return replace(lever, longer=-float(grows))
+    antenna_m = antenna_places_m(mapper, positions.unit, positions.lever_arm_m)
+    moved_m = mapper.state.unit_rotation[positions.unit] @ lever.offset_m
+    return replace(lever, longer=growth_by_positions(positions, antenna_m, -moved_m))
 
 
 def _clock_offset(mapper: Mapper, positions: ReceiverPositions) -> ReceiverClock | None:

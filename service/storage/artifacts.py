@@ -76,7 +76,7 @@ class ArtifactStore:
         self._probed: Any = None
         self._safe_folders: set[Path] = set()
         self._putting = ThreadPoolExecutor(_PUTS, thread_name_prefix="put")  # has no thread before it is used
-        if url.startswith("file://"):
+        if settings.stores_in_folder:
             self._root = Path(unquote(urlsplit(url).path))
             self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
         else:

@@ -49,6 +49,15 @@ def make_cloud(
 
 
 @pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Names of the files that children have asked for so far."""
+    result = list[str]()
+    brought = file_server._brought
+    monkeypatch.setattr(file_server, "_brought", lambda folder, file: result.append(file) or brought(folder, file))
+    return result
+
+
+@pytest.fixture
 def served(tmp_path: Path) -> Iterator[tuple[FileAddress, Path]]:
     """The address of a server for two files, of which the second one does not come."""
 
@@ -115,11 +124,8 @@ def summary_of(world: World, job: Job) -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_the_same_scene(make_cloud: Callable[..., World], brief_drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_scene(make_cloud: Callable[..., World], brief_drive: Path, asked: list[str]) -> None:
     """From a check to the scene, as where all files are laid out before."""
-    asked = list[str]()
-    brought = file_server._brought
-    monkeypatch.setattr(file_server, "_brought", lambda folder, file: asked.append(file) or brought(folder, file))
     large, small = make_cloud(drive_room_bytes=1000), make_cloud()
     jobs = {}
     for world in (large, small):
@@ -139,13 +145,8 @@ def test_the_same_scene(make_cloud: Callable[..., World], brief_drive: Path, mon
 
 
 @pytest.mark.slow
-def test_a_check_compares_no_contents(
-    make_cloud: Callable[..., World], long_drive: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_check_compares_no_contents(make_cloud: Callable[..., World], long_drive: Path, asked: list[str]) -> None:
     """Copies among images are known from the digests of their uploads: images that are not sampled are read once."""
-    asked = list[str]()
-    brought = file_server._brought
-    monkeypatch.setattr(file_server, "_brought", lambda folder, file: asked.append(file) or brought(folder, file))
     world = make_cloud(drive_room_bytes=1000)
     _, check = world.add_unchecked_drive(long_drive)
     checked = run(world, check)
@@ -155,12 +156,9 @@ def test_a_check_compares_no_contents(
 
 @pytest.mark.slow
 def test_the_join_of_sub_maps_reads_no_image_twice(
-    make_cloud: Callable[..., World], long_drive: Path, monkeypatch: pytest.MonkeyPatch
+    make_cloud: Callable[..., World], long_drive: Path, asked: list[str]
 ) -> None:
     """It needs them for pictures: the plan has checked all of them, the sub-maps have extracted what they show."""
-    asked = list[str]()
-    brought = file_server._brought
-    monkeypatch.setattr(file_server, "_brought", lambda folder, file: asked.append(file) or brought(folder, file))
     world = make_cloud(drive_room_bytes=1000, submap_workers=2)
     job_id = world.ask(world.add_drive(long_drive), wake=False, submaps=2)
     assert run(world, job_id).waiting_for == 2

@@ -55,7 +55,7 @@ def test_an_antenna_elsewhere_is_told_with_its_sign(offset_m: tuple[float, float
 def test_an_antenna_that_is_where_it_was_given_stays_there() -> None:
     found = found_by((0.0, 0.0, 0.0))
     assert not found.may_be_wrong
-    assert not found.varies
+    assert found.sigma_before_m == 0.0
     np.testing.assert_array_equal(found.offset_m, np.zeros(3))
 
 
@@ -78,7 +78,7 @@ def test_a_place_that_is_known_somewhat_is_estimated(sigma_given_m: float) -> No
     """It is as given where nothing else is said, and never less well known."""
     right, off = (found_by((0.0, by_m, 0.0), sigma_given_m=sigma_given_m) for by_m in (0.0, sigma_given_m))
     for found, by_m in ((right, 0.0), (off, sigma_given_m)):
-        assert found.varies
+        assert found.sigma_before_m > 0.0
         assert not found.is_wrong
         assert found.offset_m[1] == pytest.approx(by_m, abs=4 * found.sigma_m[1])
         assert (found.sigma_m <= sigma_given_m * (1.0 + 1e-9)).all()
