@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from mrasfm_engine.errors import InputError
-from schemas.drive import MAX_GNSS_GAP_S, MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M
+from schemas.drive import MAX_GNSS_GAP_S, MAX_IMAGE_SIDE_PX, SIGMA_TRANSLATION_M, Camera
 from schemas.findings import enumerated
 from schemas.methods import ExtractorName, MatcherName
 from schemas.misspelt import correction_of
@@ -237,16 +237,18 @@ class BundleAdjustmentConfig(_Section):
     refine_focal: bool | None = Field(
         None,
         description="the intrinsics of each camera's model vary with their priors where the drive observes the focal "
-        "length: those of several cameras where `rig_from_cam` varies too; by default those of a single camera alone",
+        "length: those of several cameras where `rig_from_cam` varies too; by default those of a single camera, and of "
+        "cameras for which the manifest declares a sigma of any of them",
     )
     min_heading_change_deg: Positive = Field(
         15.0,
         description="with `reassessment = false` alone: without GNSS, straighter drives hold the calibration as given",
     )
 
-    def intrinsics_may_vary(self, *, is_single_camera: bool) -> bool:
-        """Return whether the settings let intrinsics vary; by default those of a single camera."""
-        return is_single_camera if self.refine_focal is None else self.refine_focal
+    def intrinsics_may_vary(self, camera: Camera, *, is_single: bool) -> bool:
+        """Return whether the settings let a camera's intrinsics vary, of a drive with others or with a single one."""
+        by_default = is_single or camera.declares_intrinsics
+        return by_default if self.refine_focal is None else self.refine_focal
 
 
 class GnssConfig(_Section):

@@ -202,6 +202,12 @@ class Camera(_Model):
         "last two, what is said of rows holds for columns",
     )
 
+    @property
+    def declares_intrinsics(self) -> bool:
+        """True where it says how well any of its intrinsics is known."""
+        sigmas = (self.sigma_focal_px, self.sigma_principal_point_px, self.sigma_distortion)
+        return any(sigma is not None for sigma in sigmas)
+
     @field_validator("model")
     @classmethod
     def _known_model(cls, value: str) -> str:

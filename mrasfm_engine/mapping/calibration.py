@@ -269,6 +269,7 @@ def take_calibration(mapper: Mapper, other: Mapper) -> None:
     lengths_m = [np.linalg.norm(_about_their_mean(m.state.camera_position_m)) for m in (mapper, other)]
     if min(lengths_m) ** 2 >= MIN_BASELINES_M2:
         scale_with_baselines(mapper, float(lengths_m[1] / lengths_m[0]))
+    mapper.drive, mapper.camera_kind[:] = mapper.drive.with_rig(other.drive.manifest.rig), other.camera_kind
     mapper.state = mapper.state.with_cameras_of(other.state)
     mapper.renew_rays()
     mapper.renew_motion()

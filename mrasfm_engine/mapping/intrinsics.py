@@ -9,7 +9,7 @@ does not have as well: a rectified image is as free of distortion as its calibra
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,12 +19,14 @@ from mrasfm_engine.bundle_adjustment.observation_sampling import solve_with_chos
 from mrasfm_engine.bundle_adjustment.priors import IntrinsicsPrior, Term
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions
-from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras
+from mrasfm_engine.geometry.camera_model import FISHEYE, manifest_scales, pack_cameras, with_limit
 from mrasfm_engine.mapping.mapper import Mapper
+from mrasfm_engine.scene.rectified_cameras import model_with_distortion, rig_with_models
 from mrasfm_engine.types import Bools, Cancel, Floats
-from schemas.drive import CAMERA_MODELS, Camera
+from schemas.drive import CAMERA_MODELS, Camera, Rig
 from schemas.findings import Finding, warning
 
+DISTORTION = slice(4, INTRINSICS)  # among the intrinsics
 BEYOND_PRIOR_SIGMAS = 4.0
 HELD_TERMS = ("k3", "k4", "k5", "k6")  # of FULL_OPENCV: no prior of them is known, and k1 and k2 look nearly like them
 SIGMA_ASPECT = 5e-4  # of fy over fx: pixels are square
@@ -39,20 +41,23 @@ class IntrinsicsDecision:
     ----------
     free
         (cameras, INTRINSICS)
+    asked
+        (cameras,) whose intrinsics are free if the drive observes their focal lengths.
     sigma_focal
-        (cameras,) what the drive would know of the focal lengths, relative; NaN where nobody asked.
+        (cameras,) what the drive would know of these focal lengths, relative; NaN of the others.
     prior_sigma_focal
         (cameras,) the same by the prior.
     """
 
     free: Bools
-    sigma_focal: Floats = field(default_factory=lambda: np.zeros(0))
-    prior_sigma_focal: Floats = field(default_factory=lambda: np.zeros(0))
+    asked: Bools
+    sigma_focal: Floats
+    prior_sigma_focal: Floats
 
     @property
-    def asked(self) -> bool:
-        """True where the settings let intrinsics vary."""
-        return len(self.sigma_focal) > 0
+    def distortion_varies(self) -> Bools:
+        """Cameras (cameras,) of whose distortion any term is free."""
+        return np.asarray(self.free[:, DISTORTION].any(axis=1))
 
     def findings(self, mapper: Mapper) -> list[Finding]:
         """Focal lengths that the drive does not observe although the settings ask for them, those that left their
@@ -60,7 +65,9 @@ class IntrinsicsDecision:
         """
         found = []
         off = np.log(mapper.state.camera_params[:, 0] / pack_cameras(mapper.drive.cameras)[1][:, 0])
-        for c, camera in enumerate(mapper.drive.cameras if self.asked else ()):
+        for c, camera in enumerate(mapper.drive.cameras):
+            if not self.asked[c]:
+                continue
             if not self.free[c, 0] and mapper.config.bundle_adjustment.refine_focal:
                 found.append(
                     warning(
@@ -93,71 +100,123 @@ class IntrinsicsDecision:
 
 def held_intrinsics(mapper: Mapper) -> IntrinsicsDecision:
     """The decision that all stay as given, for nobody asked."""
-    return IntrinsicsDecision(free=np.zeros((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_))
+    cameras = len(mapper.camera_kind)
+    return IntrinsicsDecision(
+        free=np.zeros((cameras, INTRINSICS), dtype=np.bool_),
+        asked=np.zeros(cameras, dtype=np.bool_),
+        sigma_focal=np.full(cameras, np.nan),
+        prior_sigma_focal=np.full(cameras, np.nan),
+    )
 
 
-def intrinsics_may_vary(mapper: Mapper, *, calibration_varies: bool) -> bool:
-    """True where the settings let intrinsics vary: with the cameras' places in the rig, or those of a single camera.
+def intrinsics_may_vary(mapper: Mapper, *, calibration_varies: bool) -> Bools:
+    """Cameras (cameras,) whose intrinsics the settings let vary: with their places in the rig, or a single one's.
 
-    By default the latter alone: what is wrong with its lens no other camera takes.
+    By default a single camera's, as what is wrong with its lens no other camera takes, and those for which the
+    manifest says how well any of them is known.
     """
-    settings = mapper.config.bundle_adjustment
-    is_single = mapper.drive.has_single_camera
+    settings, is_single = mapper.config.bundle_adjustment, mapper.drive.has_single_camera
     is_free = settings.refine_calibration and settings.priors and settings.camera_set_adjustment
-    may_vary = settings.intrinsics_may_vary(is_single_camera=is_single)
-    return may_vary and (calibration_varies or (is_single and is_free))
+    if not (calibration_varies or (is_single and is_free)):
+        return np.zeros(len(mapper.drive.cameras), dtype=np.bool_)
+    return np.array([settings.intrinsics_may_vary(c, is_single=is_single) for c in mapper.drive.cameras])
 
 
 def assess_intrinsics(
     mapper: Mapper,
+    asked: Bools,
     *,
     free_units: Bools,
     terms: Sequence[Term],
     options: SolverOptions,
     cancel: Cancel | None = None,
 ) -> IntrinsicsDecision:
-    """Free the intrinsics that the cameras' models have where the drive observes the focal length.
+    """Free the intrinsics that the models of cameras have where the drive observes the focal length.
+
+    A single pinhole camera, and those with a `sigma_distortion`, have a model with distortion from then on if they are
+    free: what rectified images have left of it would else pass for a part of the focal length.
 
     Parameters
     ----------
+    asked
+        Cameras (cameras,) whose intrinsics may vary.
     free_units, terms, options, cancel
         Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
     """
+    given, is_single = mapper.drive.manifest.rig, mapper.drive.has_single_camera
+    may_be_distorted = asked & np.array([is_single or c.sigma_distortion is not None for c in given.cameras])
+    take_models(mapper, given, may_be_distorted)
+    decision = _decided(mapper, asked, free_units=free_units, terms=terms, options=options, cancel=cancel)
+    take_models(mapper, given, may_be_distorted & decision.distortion_varies)
+    return decision
+
+
+def _decided(
+    mapper: Mapper,
+    asked: Bools,
+    *,
+    free_units: Bools,
+    terms: Sequence[Term],
+    options: SolverOptions,
+    cancel: Cancel | None,
+) -> IntrinsicsDecision:
+    """The decision about cameras whose models have all that may vary."""
     prior = intrinsics_prior(mapper)
-    problem = problem_of_all_intrinsics(mapper, prior, free_units=free_units, terms=terms, options=options)
+    problem = problem_of_all_intrinsics(mapper, prior, asked, free_units=free_units, terms=terms, options=options)
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
         return held_intrinsics(mapper)
     # At the solution: residuals of a focal length that is off would pass for errors that its observations share.
     an_image = mapper.config.mapping.pose_observations
     solution, _ = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
-    sigma = covariances(problem, solution).sigma_camera[:, 6]
+    sigma = np.where(asked, covariances(problem, solution).sigma_camera[:, 6], np.nan)
     observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
     return IntrinsicsDecision(
-        free=_of_models(mapper) & observed[:, None], sigma_focal=sigma, prior_sigma_focal=prior.sigma[:, 0]
+        free=_of_models(mapper) & observed[:, None],
+        asked=asked,
+        sigma_focal=sigma,
+        prior_sigma_focal=prior.sigma[:, 0],
     )
+
+
+def take_models(mapper: Mapper, given: Rig, with_distortion: Bools) -> None:
+    """Give cameras the models of a rig, or where distortion varies (cameras,) those that have terms for it.
+
+    Their present intrinsics are without distortion where the models change.
+    """
+    models = [
+        model_with_distortion(camera.model) if varies else camera.model
+        for camera, varies in zip(given.cameras, with_distortion.tolist(), strict=True)
+    ]
+    mapper.drive = mapper.drive.with_rig(rig_with_models(given, models))
+    mapper.camera_kind[:], _ = pack_cameras(mapper.drive.cameras)  # in place: whoever triangulates has it as well
+    params = zip(mapper.camera_kind.tolist(), mapper.state.camera_params, strict=True)
+    mapper.state = replace(mapper.state, camera_params=np.stack([with_limit(*own) for own in params]))
 
 
 def problem_of_all_intrinsics(
     mapper: Mapper,
     prior: IntrinsicsPrior,
+    which: Bools | None = None,
     *,
     free_units: Bools,
     free_times: Bools | None = None,
     terms: Sequence[Term],
     options: SolverOptions,
 ) -> Problem:
-    """The adjustment in which all cameras vary with all their intrinsics, also those that models do not have.
+    """The adjustment in which all cameras vary, and with all their intrinsics, also those that models do not have.
 
     Parameters
     ----------
     prior
         Of the intrinsics, beside the other `terms`.
+    which
+        Cameras (cameras,) whose intrinsics vary; all of them by default.
     """
-    cameras = len(mapper.camera_kind)
+    every = np.ones(len(mapper.camera_kind), dtype=np.bool_)
     problem, _ = mapper.problem(
         free_units,
-        free_cameras=np.ones(cameras, dtype=np.bool_),
-        free_intrinsics=np.ones((cameras, INTRINSICS), dtype=np.bool_),
+        free_cameras=every,
+        free_intrinsics=np.repeat((every if which is None else which)[:, None], INTRINSICS, axis=1),
         free_times=free_times,
         terms=[*terms, prior],
         options=options,

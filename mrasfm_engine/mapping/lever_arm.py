@@ -196,6 +196,7 @@ def lever_arm_findings(lever: LeverArm | None, *, is_taken: bool) -> list[Findin
             "antenna-position",
             f"by the shape of the way, the antenna is {' and '.join(told)} where gnss.antenna_in_rig_m says: {then}",
             "Check gnss.antenna_in_rig_m: its signs, its axes (rig.body_axes), and that it begins at the rig's origin, "
-            f"from which rig_from_cam is given.{declare}",
+            f"from which rig_from_cam is given.{declare} Distortion left in rectified images bends a scene as well: "
+            "with sigma_distortion of the cameras it is estimated.",
         )
     ]

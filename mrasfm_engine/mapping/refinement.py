@@ -159,10 +159,12 @@ def _decide_what_varies(
         result.mean_time_varies = positions_may_tell_time(mapper, result.absolute.positions)
         result.absolute.clock_varies = result.mean_time_varies
     result.intrinsics = held_intrinsics(mapper)
-    if not is_calibrated and intrinsics_may_vary(mapper, calibration_varies=result.calibration.free):
+    asked = intrinsics_may_vary(mapper, calibration_varies=result.calibration.free)
+    if not is_calibrated and asked.any():
         result.is_of_one_camera = mapper.drive.has_single_camera
         result.intrinsics = assess_intrinsics(
             mapper,
+            asked,
             free_units=free_units,
             terms=terms_of(mapper, result),
             options=solver_options(mapper, result),

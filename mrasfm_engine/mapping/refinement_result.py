@@ -79,6 +79,11 @@ class Refinement:
     road: RoadAssessment | str = "semantic_triangulation is switched off"  # the last one, or why there is none
 
     @property
+    def intrinsics_are_asked(self) -> bool:
+        """True where any camera's intrinsics are free if the drive observes its focal length."""
+        return self.intrinsics is not None and bool(self.intrinsics.asked.any())
+
+    @property
     def intrinsics_vary(self) -> bool:
         """True where any camera's intrinsics are free."""
         return self.intrinsics is not None and bool(self.intrinsics.free.any())
@@ -194,7 +199,7 @@ def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | Non
         return None
     several, terms = not mapper.drive.has_single_camera, terms_of_all_cameras(mapper, result)
     free_intrinsics = None
-    if result.intrinsics is not None and result.intrinsics.asked:
+    if result.intrinsics_are_asked:
         # Whoever lets the focal length vary is not certain of the others either.
         free_intrinsics = np.ones((len(mapper.camera_kind), INTRINSICS), dtype=np.bool_)
         if not result.intrinsics_vary:
@@ -219,8 +224,7 @@ def systematic_errors_of(mapper: Mapper, result: Refinement, free_units: Bools) 
 
     None where cameras were held, and where intrinsics might vary: then their priors are in the certainty.
     """
-    asked = result.intrinsics is not None and result.intrinsics.asked
-    if result.certainty is None or not result.calibration.free or asked:
+    if result.certainty is None or not result.calibration.free or result.intrinsics_are_asked:
         return None
     return systematic_errors(
         mapper,

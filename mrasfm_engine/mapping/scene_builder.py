@@ -116,18 +116,17 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
     prior: CalibrationPrior = calibration_prior(mapper)
     sigma = prior.sigma
     focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
-    intrinsics = refinement.intrinsics
-    asked = intrinsics is not None and intrinsics.asked
+    intrinsics, asked = refinement.intrinsics, refinement.intrinsics_are_asked
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
         # A camera that is held is as good as what was given, whatever the drive would know of it.
         sigma = np.where(refinement.recalibrated[:, None], refinement.certainty.sigma_camera[:, :6], sigma)
-        if asked:
+        if asked and intrinsics is not None:
             focal_px = [
                 unpack_camera(c.model, p)[0]
                 for c, p in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
             ]
-            focal = refinement.certainty.sigma_camera[:, 6] * np.array(focal_px)
+            focal = np.where(intrinsics.asked, refinement.certainty.sigma_camera[:, 6] * np.array(focal_px), focal)
     # What was given scatters by nothing, and priors of lenses are no scatter.
     scatter = np.where(refinement.recalibrated[:, None] & (not asked), sigma, np.nan)
     if refinement.systematic is not None:
@@ -146,7 +145,7 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
             sigma_focal_px=float(focal[c]),
             observed=observed[c],
             is_wrong=c in wrong,
-            focal_observed=bool(intrinsics.free[c, 0]) if intrinsics is not None and asked else None,
+            focal_observed=bool(intrinsics.free[c, 0]) if intrinsics is not None and intrinsics.asked[c] else None,
             **_time_offset(mapper, refinement, c),
         )
         for c, camera in enumerate(mapper.drive.cameras)

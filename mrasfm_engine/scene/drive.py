@@ -11,7 +11,7 @@ import numpy as np
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.types import Bools, BringFile, Floats, Ints
-from schemas import Camera, DriveManifest, Frame, Pose
+from schemas import Camera, DriveManifest, Frame, Pose, Rig
 
 
 def matrix_from_pose(pose: Pose) -> Floats:
@@ -94,6 +94,10 @@ class Drive:
     def part(self, units: range) -> Drive:
         """The drive of units that follow one another alone."""
         return self._with_frames(self.manifest.frames[units.start : units.stop])
+
+    def with_rig(self, rig: Rig) -> Drive:
+        """The drive with another description of its cameras."""
+        return replace(self, manifest=self.manifest.model_copy(update={"rig": rig}))
 
     def _with_frames(self, frames: list[Frame]) -> Drive:
         return replace(self, manifest=self.manifest.model_copy(update={"frames": frames}))

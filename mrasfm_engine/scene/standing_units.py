@@ -43,6 +43,7 @@ def with_standing_units(scene: Scene, drive: Drive, included: Bools, moved_px: F
     moved_px
         (units,) how far the images of units between moved, NaN for those that are included.
     """
+    drive = drive.with_rig(scene.drive.manifest.rig)  # whose lens models are those that were found
     unit_of = np.flatnonzero(included)
     units, images = len(included), drive.images
     new_image = np.flatnonzero(included[[image.unit for image in images]])

@@ -31,6 +31,7 @@ from mrasfm_engine.mapping.receiver_findings import (
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
+from mrasfm_engine.scene.rectified_cameras import rig_with_models
 from mrasfm_engine.scene.scene import ImageFeatures, Scene
 from mrasfm_engine.stages._mapping import MappedDrive, numbered
 from mrasfm_engine.stages._run import Run
@@ -53,7 +54,8 @@ class _Refined:
     def to_arrays(self) -> Arrays:
         """Everything but what came from earlier stages, for `from_arrays`."""
         arrays, scene = pack_scene(self.scene)
-        about = {"findings": self.findings, "report": self.report, "seconds": self.seconds}
+        models = [camera.model for camera in self.scene.drive.cameras]
+        about = {"models": models, "findings": self.findings, "report": self.report, "seconds": self.seconds}
         document = json.dumps({"scene": scene, **about}, default=plain)
         return {**arrays, _DOCUMENT: np.frombuffer(document.encode(), dtype=np.uint8)}
 
@@ -61,10 +63,11 @@ class _Refined:
     def from_arrays(arrays: Arrays, run: Run, mapped: MappedDrive) -> _Refined:
         """The component whose `to_arrays` these are."""
         document = json.loads(arrays[_DOCUMENT].tobytes())
+        rig = rig_with_models(run.drive.manifest.rig, document.pop("models"))
         scene = unpack_scene(
             arrays,
             document.pop("scene"),
-            drive=run.drive,
+            drive=run.drive.with_rig(rig),
             features=mapped.features,
             pairs=mapped.pairs,
             own_cars=run.own_cars,

@@ -25,6 +25,7 @@ from tests.benchmarks.table import Figure, exactly
 
 TURNED = 1  # of the rig's two cameras
 FOCAL, SIGMA_FOCAL = 1.01, 0.02
+SIGMA_DISTORTION = 0.005  # as by default where nothing is declared
 TURNING = ("--cameras", 6, "--units", 40, "--seed", 1, "--width", 640, "--height", 360)
 RTK = Receiver(white_m=0.02, declared_m=0.02)
 ARM_M = np.array([0.5, 0.1, 1.5])
@@ -60,6 +61,31 @@ def wrong_manifests(data: Path, work: Path) -> Iterator[Figure]:
                 most=0.1,
             )
     yield from _focal_lengths(drive, work)
+    yield from _distortion_left(data, work)
+
+
+def _distortion_left(data: Path, work: Path) -> Iterator[Figure]:
+    """A real drive that turns, in whose rectified images distortion is left, and says so."""
+    drive = imported(data, "kitti01", work)
+    rtk = _rtk(drive)
+    for title, options, edits, most_m in (
+        ("without GNSS", ("--no-gnss",), [], 0.20),
+        ("GNSS", (), [], 0.12),
+        ("RTK of 2 cm", (), [rtk], 0.05),
+    ):
+        title = f"kitti01, sigma_distortion declared, {title}"
+        scene = _reconstructed(drive, work / title, [*edits, _uncertain_distortion], *options)
+        errors = evaluate(scene, drive)
+        yield rmse(title, errors, most_m)
+        yield Figure(
+            line="18",
+            what=f"{title}: position, similarity RMSE",
+            value=errors["similarity"]["rmse_m"],
+            unit="m",
+            most=0.05,
+        )
+        moved = sum(finding["code"] == "antenna-position" for finding in read_report(scene)["findings"])
+        yield exactly("18", f"{title}: findings of an antenna that is elsewhere", moved, 0)
 
 
 def _focal_lengths(drive: Path, work: Path) -> Iterator[Figure]:
@@ -111,6 +137,12 @@ def _reconstructed(drive: Path, out: Path, edits: Sequence[Edit], *options: obje
 def _long_focal_lengths(manifest: dict[str, Any]) -> None:
     for camera in manifest["rig"]["cameras"]:
         camera["params"][:2] = [FOCAL * focal_px for focal_px in camera["params"][:2]]
+
+
+def _uncertain_distortion(manifest: dict[str, Any]) -> None:
+    manifest["version"] = 2
+    for camera in manifest["rig"]["cameras"]:
+        camera["sigma_distortion"] = SIGMA_DISTORTION
 
 
 def _rtk(drive: Path) -> Edit:

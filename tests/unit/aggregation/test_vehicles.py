@@ -285,6 +285,22 @@ def test_focal_lengths_of_single_cameras_are_shared_by_default(base: SourceScene
     assert known.all() if refine_focal is None else not known.any()
 
 
+def test_focal_lengths_that_manifests_declare_uncertain_are_shared_by_default(base: SourceScene) -> None:
+    rng = np.random.default_rng(12)
+    truth = true_vehicle(base, 2, rng)
+    both = [with_focal(seen(base, str(k), truth, k, WELL, rng), 0.004, 0.0002) for k in range(2)]
+    (vehicle,) = vehicles_of([with_declared_focal(scene) for scene in both], CONFIG)
+    assert np.isfinite(vehicle.expected[1].sigma[:, 6]).tolist() == [True, *[False] * (len(base.drive.cameras) - 1)]
+
+
+def with_declared_focal(scene: SourceScene) -> SourceScene:
+    """Of the first camera."""
+    first, *others = scene.manifest.rig.cameras
+    cameras = [first.model_copy(update={"sigma_focal_px": 0.01 * first.params[0]}), *others]
+    rig = scene.manifest.rig.model_copy(update={"cameras": cameras})
+    return replace(scene, manifest=scene.manifest.model_copy(update={"rig": rig}))
+
+
 def first_camera_of(scene: SourceScene) -> SourceScene:
     cameras = scene.manifest.rig.cameras[:1]
     manifest = scene.manifest.model_copy(update={"rig": scene.manifest.rig.model_copy(update={"cameras": cameras})})
