@@ -11,6 +11,12 @@ from typing import Protocol
 
 import numpy as np
 
+from mrasfm_engine.bundle_adjustment.cauchy_loss import (
+    cauchy_cost,
+    cauchy_loss,
+    cauchy_weights,
+    relative_cauchy_losses,
+)
 from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, PLACES_OF_INTRINSICS, READOUT, TIME, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
@@ -138,7 +144,7 @@ def _cost_of_rig(r: Floats, held: Bools, gauge: Floats, loss_scale: float) -> fl
     Of a camera's own there is a Cauchy loss each over rotation and translation, of those that are not held, and squares
     of the rest.
     """
-    own = _cauchy_loss(_squared(np.where(held, 0.0, r)), loss_scale) + (r[held] ** 2).sum() / HELD_SHARE**2
+    own = cauchy_loss(_squared(np.where(held, 0.0, r)), loss_scale) + (r[held] ** 2).sum() / HELD_SHARE**2
     return float(0.5 * own + 0.5 * GAUGE_STIFFNESS * ((gauge * r).sum(0) ** 2).sum())
 
 
@@ -406,31 +412,6 @@ def antenna_jacobian(arm: Floats, sigma_m: Floats) -> Floats:
     """Derivatives (n, 3, 6) of `antenna_residuals` by steps of the units: d (R arm) / d omega = -[R arm]x."""
     j = np.concatenate([-se3.skew(arm), np.broadcast_to(np.eye(3), (len(arm), 3, 3))], axis=2)
     result: Floats = j / sigma_m[:, :, None]
-    return result
-
-
-def cauchy_weights(residuals: Floats, loss_scale: float) -> Floats:
-    """Weights (n,) under a Cauchy loss of residuals (n, k) over sigma, each taken as a whole."""
-    result: Floats = 1.0 / (1.0 + (residuals**2).sum(1) / loss_scale**2)
-    return result
-
-
-def cauchy_cost(residuals: Floats, loss_scale: float) -> float:
-    """Half the sum of the Cauchy loss of residuals (n, k) over sigma."""
-    return 0.5 * _cauchy_loss((residuals**2).sum(1), loss_scale)
-
-
-def _cauchy_loss(squared: Floats, loss_scale: float) -> float:
-    """Sum of the Cauchy loss of residuals over sigma with squared lengths of any shape."""
-    return float(loss_scale**2 * relative_cauchy_losses(squared, loss_scale).sum())
-
-
-def relative_cauchy_losses(squared: Floats, loss_scale: float = 1.0) -> Floats:
-    """Cauchy losses, over the square of their scale, of residuals with squared lengths of any shape.
-
-    These are over sigma, or over sigma and the loss's scale, which then is 1.
-    """
-    result: Floats = np.log1p(squared / loss_scale**2)
     return result
 
 

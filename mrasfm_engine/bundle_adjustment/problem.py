@@ -142,10 +142,6 @@ class Layout:
         """Length of the reduced vector."""
         return UNIT_DOF * self.num_units + self.camera_dof * self.num_cameras
 
-    def camera_offsets(self, cameras: Ints) -> Ints:
-        """First index of each (free) camera's step."""
-        return UNIT_DOF * self.num_units + self.camera_dof * self.camera_slot[cameras]
-
     def held(self) -> Ints:
         """Positions of the reduced vector that have a slot but may not move (intrinsics and times that are held)."""
         places = np.zeros((self.num_cameras, CAMERA_DOF), dtype=np.bool_)

@@ -26,12 +26,8 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 
-from mrasfm_engine.bundle_adjustment.priors import (
-    add_to_units,
-    antenna_jacobian,
-    antenna_residuals,
-    cauchy_cost,
-)
+from mrasfm_engine.bundle_adjustment.cauchy_loss import cauchy_cost
+from mrasfm_engine.bundle_adjustment.priors import add_to_units, antenna_jacobian, antenna_residuals
 from mrasfm_engine.bundle_adjustment.problem import UNIT_DOF, Layout
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry.small_cholesky import factorise, solve

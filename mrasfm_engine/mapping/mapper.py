@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -176,17 +175,6 @@ class Mapper:
             camera_rotation=np.where(cameras[:, None, None], begun[:, :3, :3], state.camera_rotation),
             camera_position_m=np.where(cameras[:, None], begun[:, :3, 3], state.camera_position_m),
         )
-
-    def with_points_of(self, units: Bools) -> Mapper:
-        """A mapper of the same poses whose units (units,) alone are registered, with points triangulated from these."""
-        result = copy.copy(self)
-        result.registered = self.registered & units
-        result.state = replace(self.state, points_m=np.zeros_like(self.state.points_m))
-        for name in ("triangulated", "is_inlier", "rejected"):
-            setattr(result, name, np.zeros_like(getattr(self, name)))
-        result.triangulate()
-        result.filter(self.config.mapping.filter_error_px)
-        return result
 
     def set_pose(self, unit: int, world_from_rig: Floats) -> None:
         """Give a unit a pose and count it as registered."""

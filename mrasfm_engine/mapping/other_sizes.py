@@ -22,8 +22,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from mrasfm_engine.bundle_adjustment.cauchy_loss import relative_cauchy_losses
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances
-from mrasfm_engine.bundle_adjustment.priors import Term, relative_cauchy_losses
+from mrasfm_engine.bundle_adjustment.priors import Term
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.calibration import scale_scene, sigma_scale_of_images
 from mrasfm_engine.mapping.mapper import Mapper

@@ -8,7 +8,7 @@ that the pictures differ by nothing but the calibration.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,7 +17,7 @@ import numpy as np
 from mrasfm_engine.geometry.camera_model import project
 from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
+from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.pixel_lattice import (
     LINEAR,
     SKIPPED,
@@ -31,12 +31,10 @@ from mrasfm_engine.visualization.pixel_lattice import (
 from mrasfm_engine.visualization.views import (
     MIN_RESOLUTION_PX,
     VIEW_M,
-    Read,
     View,
     find_pixel,
     height_at,
     hidden_by_car,
-    paint_views,
     place_view,
     sample,
     shows,
@@ -161,21 +159,6 @@ class MosaicPainter:
     def mosaics(self) -> list[Mosaic]:
         """The mosaics of all grids, of what has been painted."""
         return [replace(mosaic, images_used=int(n)) for mosaic, n in zip(self._mosaics, self._used, strict=True)]
-
-
-def make_mosaics(
-    views: Sequence[View],
-    grids: Sequence[Grid],
-    ground: GroundHeights,
-    read: Read,
-    *,
-    own_car_m: Floats | None,
-    step: Callable[[int], None] = lambda done: None,
-) -> list[Mosaic]:
-    """Paint the ground of every grid with all views; see `MosaicPainter` and `views.paint_views`."""
-    painter = MosaicPainter(grids, GroundTiles(ground), own_car_m=own_car_m)
-    paint_views(views, read, [painter], step=step)
-    return painter.mosaics()
 
 
 def _empty(grid: Grid) -> Mosaic:

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from mrasfm_engine.benchmark.baselines import Baseline
-from mrasfm_engine.evaluation.cameras import compare_camera_poses
 from mrasfm_engine.io.read_scene import read_poses
 from tests.benchmarks.colmap import beside_colmap
 from tests.benchmarks.commands import evaluate, mrasfm
 from tests.benchmarks.table import Figure, exactly
+from tests.helpers.camera_errors import compare_camera_poses
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mrasfm_engine.evaluation.cameras import compare_calibrations
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.read_scene import read_calibration
 from mrasfm_engine.io.trajectory_file import read_tum
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.table import Figure, exactly
 from tests.benchmarks.true_information import ExactScene, camera_information, expected_directions
+from tests.helpers.camera_errors import compare_calibrations
 
 CAMERAS, UNITS = 6, 40
 SIZE = ("--width", 640, "--height", 360)  # the time of the whole run is bounded

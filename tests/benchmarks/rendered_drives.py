@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from mrasfm_engine.evaluation.cameras import compare_calibrations
 from mrasfm_engine.evaluation.trajectory import FIRST_UNITS, end_error_m
 from mrasfm_engine.io.read_scene import read_calibration, read_poses
 from mrasfm_engine.io.trajectory_file import read_tum
 from tests.benchmarks.commands import evaluate, mrasfm, read_report
 from tests.benchmarks.edited_drives import edited_drive
 from tests.benchmarks.table import Figure, exactly
+from tests.helpers.camera_errors import compare_calibrations
 
 SEEDS = (1, 2, 3, 4, 5)
 CAMERAS, UNITS = 6, 40

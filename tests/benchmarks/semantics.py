@@ -13,13 +13,14 @@ odd number only: none of them is left out for its own distance to the surface. P
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -251,7 +252,14 @@ def held_out_thickness(mapper: Mapper, parity: int) -> tuple[Thickness, Thicknes
 
 def _seen_by(mapper: Mapper, parity: int) -> Mapper:
     """The mapper with points from units of one parity only."""
-    return mapper.with_points_of(np.arange(len(mapper.registered)) % 2 == parity)
+    result = copy.copy(mapper)
+    result.registered = mapper.registered & (np.arange(len(mapper.registered)) % 2 == parity)
+    result.state = replace(mapper.state, points_m=np.zeros_like(mapper.state.points_m))
+    for name in ("triangulated", "is_inlier", "rejected"):
+        setattr(result, name, np.zeros_like(getattr(mapper, name)))
+    result.triangulate()
+    result.filter(mapper.config.mapping.filter_error_px)
+    return result
 
 
 def _reconstruct_without(drive: Path, out: Path, *options: str, like: Path) -> None:

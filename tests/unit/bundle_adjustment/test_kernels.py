@@ -335,7 +335,6 @@ def test_fixed_units_and_cameras_have_no_place_in_the_system() -> None:
     layout = Layout.from_free(np.array([False, True, False, True]), np.array([True, False]))
     assert layout.size == 2 * UNIT_DOF + 7
     assert layout.unit_slot.tolist() == [-1, 0, -1, 1]
-    assert layout.camera_offsets(np.array([0])).tolist() == [12]
     assert layout.held().tolist() == [18]
     one = np.array([True])
     assert not len(Layout.from_free(one, one, free_intrinsics=intrinsics_mask(1, focal=True)).held())

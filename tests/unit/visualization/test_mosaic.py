@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 import pytest
 
@@ -10,14 +12,29 @@ from mrasfm_engine.visualization.agreement import MAX_PLOTS, PLOT_SIDE_M, measur
 from mrasfm_engine.visualization.birds_eye import grids_along
 from mrasfm_engine.visualization.drawing import framed
 from mrasfm_engine.visualization.exposure import camera_gains
-from mrasfm_engine.visualization.mosaic import Grid, Mosaic, make_mosaics
-from mrasfm_engine.visualization.views import AHEAD, GIVEN, REFINED, View, sample
+from mrasfm_engine.visualization.ground import GroundHeights, GroundTiles
+from mrasfm_engine.visualization.mosaic import Grid, Mosaic, MosaicPainter
+from mrasfm_engine.visualization.views import AHEAD, GIVEN, REFINED, Read, View, paint_views, sample
 from tests.helpers.painted_ground import SIZE_PX, Level, Slope, looking, pattern, photographed, view_of
 from tests.helpers.slow import slow
 
 MAX_TEXTURE_PX = 16_384  # of browsers and graphics cards
 WAY = np.column_stack([np.linspace(0, 8, 9), np.zeros(9)])
 YAWS_DEG = (0.0, 40.0)  # of the two cameras, which see much of the same ground
+
+
+def make_mosaics(
+    views: Sequence[View],
+    grids: Sequence[Grid],
+    ground: GroundHeights,
+    read: Read,
+    *,
+    own_car_m: np.ndarray | None,
+    step: Callable[[int], None] = lambda done: None,
+) -> list[Mosaic]:
+    painter = MosaicPainter(grids, GroundTiles(ground), own_car_m=own_car_m)
+    paint_views(views, read, [painter], step=step)
+    return painter.mosaics()
 
 
 def mosaic_of(

@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.evaluation.cameras import compare_calibrations, compare_camera_poses
 from mrasfm_engine.geometry import se3
+from tests.helpers.camera_errors import compare_calibrations, compare_camera_poses
 
 WORLD = se3.transform(se3.exp_so3([0.3, -0.4, 2.0]), [1000.0, -500.0, 20.0])
 

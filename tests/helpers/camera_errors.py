@@ -1,4 +1,4 @@
-"""Errors of estimated camera poses and of a camera set's calibration."""
+"""Errors of estimated camera poses and of a camera set's calibration, for measurements and their tests."""
 
 from __future__ import annotations
 
