@@ -165,17 +165,22 @@ def distorted(simulated: SimulatedDrive, **declared: float) -> SimulatedDrive:
     ("cameras", "declared", "straight"),
     [
         (1, {}, False),
-        (3, {"sigma_distortion": 0.01}, False),
+        (3, {"sigma_focal_px": 3.0}, False),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in ((1, {}, True), (3, {"sigma_distortion": 0.01}, True), (3, {}, False))
+            for case in (
+                (1, {}, True),
+                (3, {}, False),
+                (3, {"sigma_distortion": 0.01}, False),
+                (3, {"sigma_distortion": 0.01}, True),
+            )
         ),
     ],
 )
 def test_distortion_that_is_left_in_images_of_pinhole_cameras(
     cameras: int, declared: dict[str, float], straight: bool
 ) -> None:
-    """It is found where a single camera turns, or the manifest says that there may be some; else they stay pinholes."""
+    """It is found where a single camera turns, or intrinsics are declared uncertain; else they stay pinholes."""
     simulated = make_simulated_drive(units=30, cameras=cameras, points=2500, straight=straight)
     simulated = distorted(simulated, **declared)
     mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(30))
