@@ -18,8 +18,9 @@ from mrasfm_engine.errors import InputError
 from mrasfm_engine.geometry import geodesy, se3
 from mrasfm_engine.io.read_model import ModelImage, read_images, read_points, read_vertices
 from mrasfm_engine.scene.drive import matrix_from_pose
+from mrasfm_engine.scene.receiver_as_found import gnss_as_found
 from mrasfm_engine.types import Bools, Bytes, Floats, Floats32, Ints
-from schemas import Camera, DriveManifest, Gnss, Pose
+from schemas import Camera, DriveManifest, Pose
 from schemas.artifacts import COMPONENT_MARK, COMPONENTS_FOLDER, REPORT_FILE, component_folder, component_scene
 from schemas.file_names import portable_key
 from schemas.gnss_check import MAX_SPEED_MPS
@@ -256,14 +257,7 @@ def _with_receiver(folder: Path, manifest: DriveManifest, report: dict[str, Any]
         found = [stage["gnss"] for stage in report.get("stages", ()) if "gnss" in stage]
         if manifest.gnss is None or not found:
             return manifest
-        gnss = dict(manifest.gnss)
-        if "antenna" in found[-1]:
-            gnss["antenna_in_rig_m"] = found[-1]["antenna"]["used_in_rig_m"]
-        if "clock_offset_s" in found[-1]:
-            late_us = round(float(found[-1]["clock_offset_s"]) * 1e6)
-            samples = [dict(sample) | {"timestamp_us": sample.timestamp_us + late_us} for sample in gnss["samples"]]
-            gnss["samples"] = [sample for sample in samples if sample["timestamp_us"] >= 0]
-        return manifest.model_copy(update={"gnss": Gnss(**gnss)})
+        return manifest.model_copy(update={"gnss": gnss_as_found(manifest.gnss, found[-1])})
 
 
 def _arrays(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from mrasfm_engine.geometry import geodesy
 from mrasfm_engine.geometry.camera_model import pack_camera, project_points
 from mrasfm_engine.io.heights import ellipsoidal_heights
+from mrasfm_engine.scene.receiver_as_found import gnss_as_found
 from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats
 
@@ -74,10 +77,11 @@ def _of_camera(scene: Scene, number: int, length_px: Floats, pixels: Floats) -> 
     )
 
 
-def gnss_residuals(scene: Scene) -> tuple[Floats, Floats] | None:
+def gnss_residuals(scene: Scene, found: Mapping[str, Any]) -> tuple[Floats, Floats] | None:
     """Seconds since the first unit (n,), and the receiver's positions less those of the antenna (n, 3), east-north-up.
 
-    None without a place on the earth or without samples between registered units.
+    With the clock and the antenna as `found`, by the refinement's report. None without a place on the earth or without
+    samples between registered units.
     """
     gnss, place = scene.drive.manifest.gnss, scene.georeference
     units = np.flatnonzero(scene.unit_registered)
@@ -85,6 +89,7 @@ def gnss_residuals(scene: Scene) -> tuple[Floats, Floats] | None:
         return None
     units = units[np.argsort(scene.drive.timestamps_us[units], kind="stable")]
     times_us = scene.drive.timestamps_us[units]
+    gnss = gnss_as_found(gnss, found)
     samples = [s for s in gnss.samples if times_us[0] <= s.timestamp_us <= times_us[-1]]
     if not samples:
         return None

@@ -157,7 +157,8 @@ def _residuals(cameras: Sequence[CameraResiduals] | None) -> str:
 
 
 def _gnss(scene: Scene, refinement: Mapping[str, Any]) -> str:
-    found, gnss = gnss_residuals(scene), refinement.get("gnss", {})
+    gnss = refinement.get("gnss", {})
+    found = gnss_residuals(scene, gnss)
     if found is None:
         return ""
     seconds, off_m = found

@@ -21,6 +21,8 @@ from mrasfm_engine.export.report_page._html import preview
 from mrasfm_engine.export.report_page._maps import map_page
 from mrasfm_engine.export.report_page._read_back import MOST_BYTES, faults_of
 from mrasfm_engine.export.scene import write_scene
+from mrasfm_engine.geometry import geodesy
+from schemas import Gnss, GnssSample
 from schemas.artifacts import REPORT_PAGE
 from tests.helpers.export_example import make_scene
 
@@ -169,8 +171,37 @@ def test_residuals_are_those_of_the_scene() -> None:
 
 
 def test_without_gnss_there_is_no_chart_of_it(page: str) -> None:
-    assert gnss_residuals(make_scene()) is None
+    assert gnss_residuals(make_scene(), {}) is None
     assert "GNSS residuals" not in page
+
+
+def test_residuals_are_those_of_the_antenna_and_the_clock_that_the_scene_found() -> None:
+    scene, antenna_m, late_us = make_scene(), [0.5, -0.3, 1.7], 40_000
+    units = np.flatnonzero(scene.unit_registered)
+    poses = scene.world_from_rig[units]
+    assert scene.georeference is not None
+    places = geodesy.geodetic_from_local(
+        poses[:, :3, :3] @ antenna_m + poses[:, :3, 3], scene.georeference.ecef_from_local
+    )
+    samples = [
+        GnssSample(
+            timestamp_us=int(at) - late_us, latitude_deg=latitude, longitude_deg=longitude, height_m=height,
+            sigma_horizontal_m=0.02, sigma_vertical_m=0.03,
+        )
+        for at, (latitude, longitude, height) in zip(scene.drive.timestamps_us[units], places.tolist(), strict=True)
+    ]  # fmt: skip
+    gnss = Gnss(height_datum="ellipsoidal", antenna_in_rig_m=[0.0, 0.0, 0.0], samples=samples)
+    manifest = scene.drive.manifest.model_copy(update={"gnss": gnss})
+    scene = replace(scene, drive=replace(scene.drive, manifest=manifest))
+    as_given = gnss_residuals(scene, {})
+    assert as_given is not None
+    assert np.abs(as_given[1]).max() > 1.0
+    found = gnss_residuals(
+        scene, {"antenna": {"used_in_rig_m": antenna_m}, "clock_offset_s": late_us / 1e6, "units_used": len(units)}
+    )
+    assert found is not None
+    assert len(found[0]) == len(units)
+    np.testing.assert_allclose(found[1], 0.0, atol=1e-3)
 
 
 def test_previews_are_bounded(tmp_path: Path) -> None:
