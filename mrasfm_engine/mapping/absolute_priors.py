@@ -69,6 +69,7 @@ class AbsolutePriors:
     clock: ReceiverClock | None = None  # the receiver's, at which the track has its times; None where it is right
     lever: LeverArm | None = None  # where the lever arm is estimated: by how much it is another one than was given
     doubted_lever: LeverArm | None = None  # where it is not: what it more probably is
+    clock_was_let_go: bool = False  # after positions had its times
     clock_leap: ClockLeap | None = None  # of that clock, behind or before which positions take no part
     clock_varies: bool = False  # whether the adjustment varies when all images were taken
 
@@ -207,7 +208,7 @@ class AbsolutePriors:
         if self.placement is None or self.placement.prior is None or self.gnss is None:
             return False
         clock = None if self.clock_varies else find_clock(mapper, self.placement)
-        clock = clock if clock is not None and clock.is_wrong else None
+        clock = clock if clock is not None and clock.is_wrong and not self.clock_was_let_go else None
         lever = find_lever_arm(mapper, self.placement, sigma_given_m=self.sigma_antenna_m, times_vary=self.clock_varies)
         is_other = False if self.clock_varies else self._take_clock(clock)
         if self.sigma_antenna_m > 0.0:
@@ -223,6 +224,8 @@ class AbsolutePriors:
         before = self.clock
         if found is before or (found is not None and before is not None and found.is_as(before)):
             return False
+        # Positions that show a clock until they have its times do not show one: a place of the antenna looks alike.
+        self.clock_was_let_go |= before is not None and found is None
         offset_s, before_s = (0.0 if clock is None else clock.offset_s for clock in (found, before))
         self.gnss, self.clock = self.gnss.later_by(offset_s - before_s), found
         self.placement = replace(self.placement, track=self.gnss, clock=found)

@@ -9,6 +9,7 @@ import pytest
 
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.geometry.alignment import align_similarity
+from mrasfm_engine.mapping import absolute_priors
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.mapping_report import describe_refinement
 from mrasfm_engine.mapping.receiver_clock import ReceiverClock, clock_offset
@@ -130,3 +131,21 @@ def test_a_late_receiver_is_found_and_does_not_change_the_length_of_the_scene(la
     assert result.certainty is not None
     assert abs(scale_error) < 3 * result.certainty.sigma_scale
     assert 1e-5 < result.certainty.sigma_scale < 0.01
+
+
+def test_a_clock_that_positions_let_go_once_they_have_its_times_is_not_taken_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The scene would be reported at one of two clocks by chance."""
+    simulated = make_simulated_drive(units=20, cameras=2, points=800)
+    mapper = with_true_poses(make_model(simulated), simulated, range(20))
+    priors = AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M)
+    assert priors.gnss is not None
+    as_given_us = priors.gnss.timestamps_us.copy()
+    wrong = ReceiverClock(offset_s=-0.08, sigma_s=0.02)
+    says = iter([wrong, None, *[wrong] * 10])
+    monkeypatch.setattr(absolute_priors, "find_clock", lambda *_: next(says))
+    priors.place(mapper)
+    priors.reassess(mapper)
+    assert priors.clock is None
+    np.testing.assert_array_equal(priors.gnss.timestamps_us, as_given_us)
