@@ -133,7 +133,8 @@ def read_scene(folder: Path, name: str) -> SourceScene:
         )
         scene = scene.of_units(_own_units(poses, scene.unit_registered, is_component=COMPONENT_MARK in name))
     with _damaged(folder / "calibration.json", name):
-        _ = scene.certainty_of_cameras, scene.given_rig_from_cam, scene.focal_given_of_found, scene.sigma_focal_px
+        _ = scene.certainty_of_cameras, scene.given_rig_from_cam, scene.given_lenses
+        _ = scene.focal_given_of_found, scene.sigma_focal_px
     if scene.unit_registered.sum() < MIN_UNITS or not len(scene.points_m):
         raise InputError(
             f"scene {name} has {int(scene.unit_registered.sum())} registered units and {len(scene.points_m)} points",

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mrasfm_engine.aggregation.lenses import Lens
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.io.stage_store import Arrays
 from mrasfm_engine.scene.drive import Drive, matrix_from_pose
@@ -140,6 +141,12 @@ class SourceScene:
         """Focal lengths (c,) of the cameras as the drive's manifest gave them, in those that the scene found."""
         cameras, documents = self.drive.cameras, self.calibration["cameras"]
         return np.array([documents[c.name]["given"]["params"][0] / c.params[0] for c in cameras], dtype=np.float64)
+
+    @cached_property
+    def given_lenses(self) -> list[Lens]:
+        """Lenses (c,) of the cameras as the drive's manifest gave them."""
+        cameras, documents = self.drive.cameras, self.calibration["cameras"]
+        return [Lens.from_camera(camera, documents[camera.name]["given"]["params"]) for camera in cameras]
 
     @cached_property
     def sigma_focal_px(self) -> Floats:

@@ -12,6 +12,9 @@ the common pose as the others' images say, weighed by their information, within 
 that, so that they may be added. The deviation follows from how much drives of the vehicle differ beyond their
 uncertainties. A camera that differs by more than `GATE_SIGMAS` was knocked, or is another one: it neither tells the
 others anything nor is told.
+
+Drives may have found a camera with different lenses: one lets intrinsics vary, another one does not observe them. All
+are compared as behind one lens, that of the first drive's manifest (see `lenses`).
 """
 
 from __future__ import annotations
@@ -22,11 +25,11 @@ from itertools import combinations
 
 import numpy as np
 
+from mrasfm_engine.aggregation.lenses import Lens, turn_and_length
 from mrasfm_engine.aggregation.significance import in_sigmas
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.config import BundleAdjustmentConfig
 from mrasfm_engine.geometry import se3
-from mrasfm_engine.geometry.camera_model import pack_camera, pack_cameras
 from mrasfm_engine.types import Bools, Floats
 from schemas.artifacts import drive_of_scene
 
@@ -52,7 +55,7 @@ class DriveCalibration:
     Attributes
     ----------
     found
-        Rotation vectors (rad) and translations (m) in rig axes, and logarithms of focal lengths.
+        Rotation vectors (rad) and translations (m) in rig axes, and logarithms of focal lengths; all behind one lens.
     by_images
         What the images alone say; NaN where they say nothing.
     information
@@ -143,9 +146,11 @@ def _vehicle(
 ) -> Vehicle:
     """One vehicle; components of a drive have one calibration, that of the first of them."""
     reference = {
-        camera.name: (pose, pack_camera(camera.model, camera.params)[1][0])
+        camera.name: (pose, lens)
         for k, *_ in drives
-        for camera, pose in zip(scenes[k].drive.cameras, scenes[k].drive.rig_from_cam, strict=True)
+        for camera, pose, lens in zip(
+            scenes[k].drive.cameras, scenes[k].drive.rig_from_cam, scenes[k].given_lenses, strict=True
+        )
     }
     found = [_calibration(k, scenes[k], reference, config) for k, *_ in drives]
     deviation = np.repeat([USUAL_DEVIATION_RAD, USUAL_DEVIATION_M, USUAL_DEVIATION_FOCAL], [3, 3, 1])
@@ -172,13 +177,11 @@ def _vehicle(
 
 
 def _calibration(
-    k: int, scene: SourceScene, reference: Mapping[str, tuple[Floats, float]], config: BundleAdjustmentConfig
+    k: int, scene: SourceScene, reference: Mapping[str, tuple[Floats, Lens]], config: BundleAdjustmentConfig
 ) -> DriveCalibration:
     cameras = scene.drive.cameras
     names = tuple(camera.name for camera in cameras)
-    base, base_focal_px = (np.stack([reference[name][part] for name in names]) for part in (0, 1))
-    focal_px = pack_cameras(cameras)[1][:, 0]
-    given_focal_px = focal_px * scene.focal_given_of_found
+    base, lenses = np.stack([reference[name][0] for name in names]), [reference[name][1] for name in names]
     # In the manifest's units, which of a MEI camera are others than at the axis.
     manifest_focal_px = np.array([c.params[0] for c in cameras])
     known = [None if c.sigma_focal_px is None else c.sigma_focal_px / c.params[0] for c in cameras]
@@ -189,11 +192,14 @@ def _calibration(
             [config.sigma_focal if sigma is None else sigma for sigma in known],
         ]
     ).repeat([3, 3, 1], axis=1)
-    found, given = (
-        np.column_stack([corrections(poses, base), np.log(focal / base_focal_px)])
-        for poses, focal in ((scene.drive.rig_from_cam, focal_px), (scene.given_rig_from_cam, given_focal_px))
+    rig_from_cam, given_rig, shift_m = scene.drive.rig_from_cam, scene.given_rig_from_cam, _shift_by_scaling(scene)
+    by_adjustment = np.column_stack(
+        [corrections(rig_from_cam, base) - corrections(given_rig, base), -np.log(scene.focal_given_of_found)]
     )
-    found[:, TRANSLATION] -= _shift_by_scaling(scene)
+    found = _behind(lenses, rig_from_cam, [Lens.from_camera(camera) for camera in cameras], base)
+    given = _behind(lenses, given_rig, scene.given_lenses, base)
+    for some in (by_adjustment, found):
+        some[:, TRANSLATION] -= shift_m
     sigma = sigma_given.copy()
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]
@@ -202,7 +208,7 @@ def _calibration(
     sigma[observed, 6] = (scene.sigma_focal_px / manifest_focal_px)[observed]
     says = sigma < NOTHING_OBSERVED * sigma_given
     information = np.where(says, sigma**-2.0 - sigma_given**-2.0, 0.0)
-    without_prior = (found - given) / (sigma_given**2 * np.where(says, information, np.inf))
+    without_prior = by_adjustment / (sigma_given**2 * np.where(says, information, np.inf))
     return DriveCalibration(
         scene=k,
         names=names,
@@ -212,6 +218,20 @@ def _calibration(
         given=given,
         sigma_given=sigma_given,
     )
+
+
+def _behind(references: Sequence[Lens], rig_from_cam: Floats, lenses: Sequence[Lens], base: Floats) -> Floats:
+    """Corrections (c, DIRECTIONS) from `base` of cameras as they are behind reference lenses.
+
+    What turns all of them is no turn of cameras: no image shows it.
+    """
+    of_lens = np.stack([turn_and_length(own, reference) for own, reference in zip(lenses, references, strict=True)])
+    turn = np.einsum("cij,cj->ci", rig_from_cam[:, :3, :3], of_lens[:, :3])
+    place_m = rig_from_cam[:, :3, 3] - rig_from_cam[:, :3, 3].mean(0)
+    common = np.concatenate([turn.mean(0), np.zeros(3)])
+    moved = corrected(rig_from_cam, np.concatenate([turn, np.zeros(turn.shape)], axis=1))
+    moved = corrected(moved, -_moved_by(common, place_m)[:, :6])
+    return np.column_stack([corrections(moved, base), of_lens[:, 3]])
 
 
 def _shift_by_scaling(scene: SourceScene) -> Floats:
@@ -246,7 +266,7 @@ def corrected(rig_from_cam: Floats, correction: Floats) -> Floats:
 
 
 def _in_one_frame(
-    found: Sequence[DriveCalibration], reference: Mapping[str, tuple[Floats, float]], deviation: Floats
+    found: Sequence[DriveCalibration], reference: Mapping[str, tuple[Floats, Lens]], deviation: Floats
 ) -> list[DriveCalibration]:
     """The drives without motions of all cameras together against the first one: images do not show these.
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.aggregation import vehicles
+from mrasfm_engine.aggregation.lenses import Lens, turn_and_length
 from mrasfm_engine.aggregation.source import SourceScene
 from mrasfm_engine.aggregation.vehicles import Vehicle, corrected, corrections, vehicles_of
 from mrasfm_engine.config import BundleAdjustmentConfig
@@ -291,6 +292,41 @@ def test_focal_lengths_that_manifests_declare_uncertain_are_shared_by_default(ba
     both = [with_focal(seen(base, str(k), truth, k, WELL, rng), 0.004, 0.0002) for k in range(2)]
     (vehicle,) = vehicles_of([with_declared_focal(scene) for scene in both], CONFIG)
     assert np.isfinite(vehicle.expected[1].sigma[:, 6]).tolist() == [True, *[False] * (len(base.drive.cameras) - 1)]
+
+
+def test_drives_that_estimate_lenses_agree_with_those_that_hold_them(base: SourceScene) -> None:
+    """What a principal point takes up of a camera's turn is no turn of the camera."""
+    rng = np.random.default_rng(13)
+    truth = true_vehicle(base, 5, rng)
+    scenes = [seen(base, str(k), truth, k, WELL, rng) for k in range(5)]
+    lenses = [with_estimated_lens(scene, 0.015) for scene in scenes[:4]]
+    as_given, estimated = one_vehicle(scenes), one_vehicle([*lenses, scenes[4]])
+    assert estimated.knocked == as_given.knocked == []
+    assert estimated.deviation_rad < 1.2 * as_given.deviation_rad
+    off = estimated.expected[4].correction - as_given.expected[4].correction
+    np.testing.assert_allclose(off[:, :3], 0.0, atol=np.radians(0.03))
+
+
+def with_estimated_lens(scene: SourceScene, share: float) -> SourceScene:
+    """The scene with principal points that share of the focal length to the right or left, and cameras turned as well.
+
+    Images show next to nothing of it. Every other camera turns the other way: they have no common motion.
+    """
+    cameras, entries = [], {}
+    for number, camera in enumerate(scene.drive.cameras):
+        fx, fy, cx, cy = camera.params
+        params = [fx, fy, cx + share * fx * (-1) ** number, cy, 0.0, 0.0, 0.0, 0.0]
+        lens = camera.model_copy(update={"model": "OPENCV", "params": params})
+        turn = turn_and_length(Lens.from_camera(lens), Lens.from_camera(camera))[:3]
+        pose = scene.drive.rig_from_cam[number].copy()
+        pose[:3, :3] = pose[:3, :3] @ se3.exp_so3(-turn)
+        cameras.append(lens.model_copy(update={"rig_from_cam": pose_from_matrix(pose)}))
+        entry = scene.calibration["cameras"][camera.name]
+        given = {**entry["given"], "params": [*camera.params, 0.0, 0.0, 0.0, 0.0]}
+        entries[camera.name] = {**entry, "given": given}
+    rig = scene.manifest.rig.model_copy(update={"cameras": cameras})
+    calibration = {**scene.calibration, "cameras": entries}
+    return replace(scene, manifest=scene.manifest.model_copy(update={"rig": rig}), calibration=calibration)
 
 
 def with_declared_focal(scene: SourceScene) -> SourceScene:
