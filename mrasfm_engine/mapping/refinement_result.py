@@ -222,9 +222,9 @@ def problem_of_all_unknowns(mapper: Mapper, result: Refinement) -> Problem | Non
 def systematic_errors_of(mapper: Mapper, result: Refinement, free_units: Bools) -> SystematicErrors | None:
     """Errors of the cameras that all images share, as those of lens models, which the certainty does not have.
 
-    None where cameras were held, and where intrinsics might vary: then their priors are in the certainty.
+    None where cameras were held, and where intrinsics varied: then what lenses err by is in the certainty.
     """
-    if result.certainty is None or not result.calibration.free or result.intrinsics_are_asked:
+    if result.certainty is None or not result.calibration.free or result.intrinsics_vary:
         return None
     return systematic_errors(
         mapper,

@@ -115,18 +115,20 @@ def _time_offset(mapper: Mapper, refinement: Refinement, camera: int) -> dict[st
 def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibration]:
     prior: CalibrationPrior = calibration_prior(mapper)
     sigma = prior.sigma
-    focal = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
+    sigma_focal_px = np.array([c.sigma_focal_px or np.nan for c in mapper.drive.cameras])
     intrinsics, asked = refinement.intrinsics, refinement.intrinsics_are_asked
     observed = np.zeros((len(sigma), 6), dtype=np.bool_)
     if refinement.certainty is not None and np.isfinite(refinement.certainty.sigma_camera[:, :6]).all():
-        # A camera that is held is as good as what was given, whatever the drive would know of it.
+        # What is held is as good as what was given, whatever the drive would know of it.
         sigma = np.where(refinement.recalibrated[:, None], refinement.certainty.sigma_camera[:, :6], sigma)
         if asked and intrinsics is not None:
             focal_px = [
                 unpack_camera(c.model, p)[0]
                 for c, p in zip(mapper.drive.cameras, mapper.state.camera_params, strict=True)
             ]
-            focal = np.where(intrinsics.asked, refinement.certainty.sigma_camera[:, 6] * np.array(focal_px), focal)
+            found, held = refinement.certainty.sigma_camera[:, 6], intrinsics.prior_sigma_focal
+            sigma_focal = np.where(intrinsics.free[:, 0], found, held) * np.array(focal_px)
+            sigma_focal_px = np.where(intrinsics.asked, sigma_focal, sigma_focal_px)
     # What was given scatters by nothing, and priors of lenses are no scatter.
     scatter = np.where(refinement.recalibrated[:, None] & (not asked), sigma, np.nan)
     if refinement.systematic is not None:
@@ -142,7 +144,7 @@ def _calibrations(mapper: Mapper, refinement: Refinement) -> list[CameraCalibrat
             sigma_translation_m=sigma[c, 3:],
             repeatability_rotation_deg=np.degrees(scatter[c, :3]),
             repeatability_translation_m=scatter[c, 3:],
-            sigma_focal_px=float(focal[c]),
+            sigma_focal_px=float(sigma_focal_px[c]),
             observed=observed[c],
             is_wrong=c in wrong,
             focal_observed=bool(intrinsics.free[c, 0]) if intrinsics is not None and intrinsics.asked[c] else None,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,9 @@ from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.refinement_result import Refinement
+from mrasfm_engine.mapping.scene_builder import build_scene
 from mrasfm_engine.mapping.systematic_errors import _Lenses, _told_by
+from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.triangulation.tracks import Keypoints
 from tests.benchmarks.sigmas import camera_errors
@@ -21,6 +24,7 @@ from tests.helpers.simulated_drive import (
     SimulatedDrive,
     make_simulated_drive,
     true_matches,
+    with_cameras,
     with_lens_errors,
 )
 
@@ -92,6 +96,27 @@ def test_other_errors_that_all_images_share_widen_sigmas() -> None:
     others = np.sqrt(result.systematic.by_others[:, :6])
     assert rms(others / repeatability) > 1.2
     assert (result.systematic.sigma_camera(repeatability) >= others).all()
+
+
+@pytest.mark.parametrize(
+    ("straight", "sigma_focal_px"), [(False, 0.05), pytest.param(True, 5.0, marks=pytest.mark.slow)]
+)
+def test_lenses_that_are_declared_uncertain_and_held_err_as_others(*, straight: bool, sigma_focal_px: float) -> None:
+    """Cameras take what is wrong with a lens that is held, however uncertain it is declared."""
+    shape: dict[str, Any] = {"straight": True} if straight else {"radius_m": 60.0}
+    exact = make_simulated_drive(units=16, cameras=2, points=2000, noise_px=0.5, **shape)
+    drive = with_lens_errors(exact, LENS_PX)
+    declared = [camera.model_copy(update={"sigma_focal_px": sigma_focal_px}) for camera in drive.drive.cameras]
+    mapper, result = refined(with_cameras(drive, declared))
+    assert result.intrinsics_are_asked
+    assert not result.intrinsics_vary
+    assert result.certainty is not None
+    assert result.systematic is not None
+    off_rad, sigma = camera_errors(mapper, drive)[:, :3], result.certainty.sigma_camera[:, :6]
+    assert rms(off_rad / sigma[:, :3]) > 2.0, "lens errors do not show in this drive"
+    assert 0.4 < rms(off_rad / result.systematic.sigma_camera(sigma)[:, :3]) < 2.0
+    scene = build_scene(mapper, result, drive.features, [], PriorTrajectory(source="none", world_from_rig=None))
+    assert [camera.sigma_focal_px for camera in scene.calibration] == pytest.approx([sigma_focal_px] * 2)
 
 
 def test_time_offsets_err_by_lenses_too() -> None:
