@@ -14,7 +14,7 @@ uncertainties. A camera that differs by more than `GATE_SIGMAS` was knocked, or 
 others anything nor is told.
 
 Drives may have found a camera with different lenses: one lets intrinsics vary, another one does not observe them. All
-are compared as behind one lens, that of the first drive's manifest (see `lenses`).
+are compared as behind one lens, that of one of the manifests (see `lenses`).
 """
 
 from __future__ import annotations
