@@ -207,8 +207,8 @@ class AbsolutePriors:
         """
         if self.placement is None or self.placement.prior is None or self.gnss is None:
             return False
-        clock = None if self.clock_varies else find_clock(mapper, self.placement)
-        clock = clock if clock is not None and clock.is_wrong and not self.clock_was_let_go else None
+        clock = None if self.clock_varies or self.clock_was_let_go else find_clock(mapper, self.placement)
+        clock = clock if clock is not None and clock.is_wrong else None
         lever = find_lever_arm(mapper, self.placement, sigma_given_m=self.sigma_antenna_m, times_vary=self.clock_varies)
         is_other = False if self.clock_varies else self._take_clock(clock)
         if self.sigma_antenna_m > 0.0:

@@ -16,11 +16,11 @@ def gnss_as_found(gnss: Gnss, found: Mapping[str, Any]) -> Gnss:
     KeyError, TypeError, ValueError
         Where the entry is not as refinements write it.
     """
-    result = dict(gnss)
+    changes: dict[str, Any] = {}
     if "antenna" in found:
-        result["antenna_in_rig_m"] = found["antenna"]["used_in_rig_m"]
+        changes["antenna_in_rig_m"] = found["antenna"]["used_in_rig_m"]
     if "clock_offset_s" in found:
         late_us = round(float(found["clock_offset_s"]) * 1e6)
         samples = [dict(sample) | {"timestamp_us": sample.timestamp_us + late_us} for sample in gnss.samples]
-        result["samples"] = [sample for sample in samples if sample["timestamp_us"] >= 0]
-    return Gnss(**result)
+        changes["samples"] = [sample for sample in samples if sample["timestamp_us"] >= 0]
+    return Gnss(**dict(gnss) | changes) if changes else gnss

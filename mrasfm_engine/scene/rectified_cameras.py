@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from schemas.drive import CAMERA_MODELS, Camera, Rig
 
-_DISTORTED = "OPENCV"
-_MODELS = {"SIMPLE_PINHOLE": _DISTORTED, "PINHOLE": _DISTORTED}
+_MODELS = {"SIMPLE_PINHOLE": "OPENCV", "PINHOLE": "OPENCV"}
 
 
 def model_with_distortion(model: str) -> str:
