@@ -259,13 +259,17 @@ class ReceiverPositions:
 
         C is the covariance of the positions' errors, with all of them at full weight.
         """
+        return self._information_and_common(columns)[0]
+
+    def _information_and_common(self, columns: Floats) -> tuple[Floats, Floats]:
+        """The same, and I + C' C (c, c) of the errors that positions have in common, with what wanders in C."""
         count = columns.shape[2]
         known = self._information_by_process(np.concatenate([columns, self.common_m], axis=2))
         of_common = np.eye(known.shape[0] - count) + known[count:, count:]
         result: Floats = known[:count, :count] - known[:count, count:] @ np.linalg.solve(
             of_common, known[count:, :count]
         )
-        return result
+        return result, of_common
 
     def _information_by_process(self, columns: Floats) -> Floats:
         """The same where positions have no error in common."""
@@ -282,15 +286,14 @@ class ReceiverPositions:
         That is of what the ways (n, 3, m), by which the scene may be moved, cannot explain [Patterson and Thompson,
         Recovery of inter-block information when block sizes are unequal, Biometrika 1971].
         """
-        known = self.information(np.concatenate([others, off_m[:, :, None]], axis=2))
+        known, of_common = self._information_and_common(np.concatenate([others, off_m[:, :, None]], axis=2))
         matrix, right = known[:-1, :-1], known[:-1, -1]
         left = float(known[-1, -1] - right @ np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
         determinant = 2.0 * float(np.log(self.sigma_m).sum()) + np.linalg.slogdet(matrix)[1]
         prior = _log_determinant(self._precision)
         for axis in range(AXES):
             determinant += _log_determinant(self._by_knots(np.ones(len(off_m)), axis)) - prior
-        common = self._information_by_process(self.common_m)
-        determinant += np.linalg.slogdet(np.eye(len(common)) + common)[1]
+        determinant += np.linalg.slogdet(of_common)[1]
         return -0.5 * (left + float(determinant))
 
     def information_given(self, way: Floats, others: Floats) -> float:

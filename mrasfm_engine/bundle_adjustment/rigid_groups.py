@@ -103,6 +103,15 @@ class RigidGroups:
         result: Floats = np.einsum("nij,nj->ni", maps, step.reshape(-1, UNIT_DOF)[of]).ravel()
         return result if np.isfinite(result).all() else None
 
+    def nearest_step(self, state: State, layout: Layout, step: Floats) -> Floats:
+        """The step (6 units,) of rigid sets that is nearest to one of units, as a sum of steps from other states is."""
+        of, maps = self.unit_from_set_steps(state, layout)
+        back = np.linalg.inv(maps) @ step.reshape(-1, UNIT_DOF, 1)
+        mean = np.zeros((self.count, UNIT_DOF))
+        np.add.at(mean, of, back[..., 0] / np.bincount(of, minlength=self.count)[of, None])
+        result: Floats = np.einsum("nij,nj->ni", maps, mean[of]).ravel()
+        return result
+
     def retract(self, state: State, layout: Layout, step: Floats, points_m: Floats) -> State:
         """The state after a step (6 units,) that `step` made: every set moved as the rigid body that it is."""
         units = np.flatnonzero(layout.unit_slot >= 0)

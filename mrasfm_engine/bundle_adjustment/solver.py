@@ -13,6 +13,7 @@ import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.bundle_adjustment.back_substitution import add_scores, substitute
+from mrasfm_engine.bundle_adjustment.extrapolation import Extrapolation
 from mrasfm_engine.bundle_adjustment.image_sums import add_images, num_image_sums
 from mrasfm_engine.bundle_adjustment.kernels import Bands, Loss, Motion, Observed, Slots, Views, squared_errors
 from mrasfm_engine.bundle_adjustment.point_elimination import Sums, accumulate
@@ -29,10 +30,6 @@ from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
 POINT_STEPS = 2  # steps of points whose poses have moved
 MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
-# Steps are lengthened where two have one direction in most of what they do: by their cosine, which is above one where
-# damping or weights have changed the metric between them, and much above where there is nothing to compare.
-COSINES = (0.7, 1.05)
-MAX_RATE = 7.0 / 8.0  # of one step's length to that before: of rates near one, two steps tell little
 
 
 class Termination(StrEnum):
@@ -253,6 +250,10 @@ class Problem:
         """The damped step (n,) of the reduced vector; None where there is none."""
         return system.step(damping) if self.sets is None else self.sets.step(system, state, damping)
 
+    def extrapolated(self, state: State, way: Floats, step: Floats) -> Floats:
+        """The way (n,) to go for a step (n,), as `step` may make one; the step itself where that is the way."""
+        return way if self.sets is None or way is step else self.sets.nearest_step(state, self.layout, way)
+
     @property
     def unknowns(self) -> int:
         """Number of unknowns of the reduced vector."""
@@ -331,11 +332,7 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     -----
     Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
 
-    The normal equations have the weights of the robust loss without its curvature, so that they take the cost for
-    steeper than it is: near the minimum every step goes along the one before and is shorter by one factor. Every other
-    step is lengthened by what the rest of that geometric series adds to it; where that costs more it is taken as it is
-    [Aitken's extrapolation of vectors: Ramiere and Helfer, Iterative residual-based vector methods to accelerate fixed
-    point iterations, Computers and Mathematics with Applications 2015].
+    Steps are extrapolated, see `extrapolation`; where that costs more, the step is taken as it is.
     """
     if problem.layout.size < SMALL_SYSTEM:
         with _THREADS.limit(limits=1, user_api="blas"):
@@ -349,24 +346,6 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
         ]
         state = replace(state, camera_params=np.stack(limited))
     return state, report
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Direction:
-    """Direction of a step that was taken as it is, by its products with other steps."""
-
-    gradient: Floats  # (n,) from which it came
-    decrement: float
-
-    def factor_of(self, step: Floats, decrement: float) -> float:
-        """Factor by which to lengthen the step (n,) that follows: the sum of its geometric series."""
-        if not (self.decrement > 0.0 and decrement > 0.0):
-            return 1.0
-        along = -float(step @ self.gradient)
-        low, high = COSINES
-        if not low < along / math.sqrt(self.decrement * decrement) < high:
-            return 1.0
-        return 1.0 / (1.0 - min(along / self.decrement, MAX_RATE))
 
 
 def _decrement_left(before: float, decrement: float) -> float:
@@ -390,8 +369,8 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     free = problem.unknowns
     if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
-    before: _Direction | None = None
-    as_it_is = 0.0  # decrement of the step before, where neither a factor nor damping changed its length
+    course, is_flat = Extrapolation(), False
+    as_it_is = 0.0  # decrement of the step before, where neither extrapolation nor damping changed it
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
@@ -401,26 +380,28 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
         if step is not None:
-            factor = 1.0
-            if before is not None and damping <= MAX_DAMPING_OF_DECREMENT:
-                factor = before.factor_of(step, decrement)
-            trial, trial_costs, trial_cost = problem.after(state, costs, system, factor * step)
-            before = _Direction(gradient=system.gradient, decrement=decrement) if factor == 1.0 else None
-            if factor > 1.0 and not trial_cost < cost:
-                factor = 1.0
+            way = step
+            if damping <= MAX_DAMPING_OF_DECREMENT:
+                way = problem.extrapolated(state, course.way_of(step, system.gradient), step)
+            trial, trial_costs, trial_cost = problem.after(state, costs, system, way)
+            if way is not step and not trial_cost < cost:
+                course.forget()
+                way = step
                 trial, trial_costs, trial_cost = problem.after(state, costs, system, step)
+            course.remember(step, system.gradient, way)
         if step is None or not trial_cost < cost:
-            before, as_it_is = None, 0.0
+            course.forget()
+            as_it_is, is_flat = 0.0, False
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
             elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        as_it_is = decrement if factor == 1.0 and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
-        # A lengthened step may end as high on the other side of the minimum.
-        is_flat = factor == 1.0 and cost - trial_cost <= options.function_tolerance * cost
-        if is_flat or (
+        as_it_is = decrement if way is step and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
+        # An extrapolated step may end as high on the other side of the minimum: one more tells.
+        was_flat, is_flat = is_flat, cost - trial_cost <= options.function_tolerance * cost
+        if (is_flat and (was_flat or way is step)) or (
             # A step that damping holds back is short wherever the minimum is.
             free and damping <= MAX_DAMPING_OF_DECREMENT and left <= options.decrement_tolerance
         ):

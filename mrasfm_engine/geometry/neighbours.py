@@ -1,25 +1,58 @@
-"""Nearest places in the plane, and nearest values on a line."""
+"""Nearest places, and nearest values on a line."""
 
 from __future__ import annotations
+
+import math
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from mrasfm_engine.jit import njit
+from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.types import Floats, Ints
 
 
+FEW = 200  # places, among which looking at every one is faster than a search tree
+
+
 def nearest(
-    places_m: Floats, xy_m: Floats, *, count: int = 1, within_m: float = np.inf, threads: int = 1
+    places_m: Floats, positions_m: Floats, *, count: int = 1, within_m: float = np.inf, threads: int = 1
 ) -> tuple[Floats, Ints]:
-    """Distances and indices (n, count), nearest first, of the places (k, 2), k > 0, around each of xy (n, 2).
+    """Distances and indices (n, count), nearest first, of the places (k, d), k > 0, around each of positions (n, d).
 
     Where there are fewer within the distance, the distance is infinite and the index 0.
     """
     count = min(count, len(places_m))
-    found = cKDTree(places_m).query(xy_m, k=count, distance_upper_bound=within_m, workers=threads)
-    distance = np.asarray(found[0], dtype=np.float64).reshape(len(xy_m), count)
-    index = np.asarray(found[1], dtype=np.int64).reshape(len(xy_m), count)
+    if count == 1 and len(places_m) <= FEW:
+        distance, index = np.empty((len(positions_m), 1)), np.empty((len(positions_m), 1), dtype=np.int64)
+        places_m, positions_m = np.ascontiguousarray(places_m.T), np.ascontiguousarray(positions_m)
+        in_ranges(
+            threads,
+            len(positions_m),
+            lambda lo, hi: _find_nearest(places_m, positions_m[lo:hi], within_m, distance[lo:hi], index[lo:hi]),
+        )
+        return distance, index
+    found = cKDTree(places_m).query(positions_m, k=count, distance_upper_bound=within_m, workers=threads)
+    distance = np.asarray(found[0], dtype=np.float64).reshape(len(positions_m), count)
+    index = np.asarray(found[1], dtype=np.int64).reshape(len(positions_m), count)
     return distance, np.where(np.isfinite(distance), index, 0)
+
+
+@njit(cache=True, nogil=True)
+def _find_nearest(places: Any, positions: Any, within: float, distance: Any, index: Any) -> None:
+    """Find the nearest of places (d, k) to each of positions (n, d), if any is nearer than `within`."""
+    d2 = np.empty(places.shape[1])
+    for n in range(len(positions)):
+        d2[:] = 0.0
+        for axis in range(places.shape[0]):
+            at = positions[n, axis]
+            for k in range(places.shape[1]):
+                d2[k] += (places[axis, k] - at) ** 2
+        best = np.argmin(d2)
+        away = math.sqrt(d2[best])
+        is_near = away < within
+        distance[n, 0], index[n, 0] = away if is_near else np.inf, best if is_near else 0
 
 
 def nearest_sorted(values: Ints | Floats, wanted: Ints | Floats) -> Ints:

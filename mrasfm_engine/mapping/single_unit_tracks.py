@@ -16,14 +16,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.special import betaln, expit, logit
 
 from mrasfm_engine.geometry import se3
 from mrasfm_engine.geometry.camera_model import project_points
+from mrasfm_engine.geometry.neighbours import nearest
 from mrasfm_engine.jit import njit
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.parallel import mapped
+from mrasfm_engine.parallel import even_bounds, in_parts
 from mrasfm_engine.triangulation.track_motion import GroundPath
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -90,7 +90,7 @@ def _off_the_ground(points_m: Floats, path: GroundPath, *, threads: int = 1) -> 
 
     Far from the path the ground may be higher, too. What is meant is the road before the vehicle, which is near.
     """
-    station = np.asarray(cKDTree(path.ground_m).query(points_m, workers=threads)[1], dtype=np.int64)
+    station = nearest(path.ground_m, points_m, threads=threads)[1][:, 0]
     height_m = ((points_m - path.ground_m[station]) * path.up[station]).sum(1)
     result: Bools = height_m > path.tolerance_m
     return result
@@ -116,41 +116,68 @@ def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
 
 def _neighbourhoods(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[_Shares, Bools]:
     """Neighbourhoods, and which tracks (tracks,) one unit alone observes."""
-    tracks, units = len(mapper.tracks), len(mapper.registered)
-    rows = np.flatnonzero(mapper.is_inlier)
-    of_keypoint = mapper.tracks.of_keypoint[rows]
-    kept = mapper.triangulated[of_keypoint] & ~moves[of_keypoint]
-    seen, images = np.unique(
-        mapper.keypoints.unit[rows[kept]] * tracks + of_keypoint[kept], return_counts=True
-    )  # by unit, and there by track
-    unit, track = np.divmod(seen, tracks)
-    single = np.bincount(track, minlength=tracks) == 1
+    counted = mapper.triangulated & ~moves
+    unit, track, images = _points_of_units(mapper.is_inlier, mapper.tracks.of_keypoint, mapper.keypoints.unit, counted)
+    single = np.bincount(track, minlength=len(counted)) == 1
     points_m, goes_on = mapper.state.points_m[track], ~single[track]
     asked = np.flatnonzero(images > 1)
     asked = asked[_off_the_ground(points_m[asked], path, threads=mapper.config.threads)]
     asked = asked[_seen_by_next(mapper, points_m[asked], unit[asked])]
-    begins = np.searchsorted(unit, np.arange(units + 1))
-    first = np.searchsorted(unit[asked], np.arange(units + 1))
-
-    def of_unit(u: int) -> tuple[Ints, Ints]:
-        here = slice(begins[u], begins[u + 1])
-        return _around(points_m[here], goes_on[here], asked[first[u] : first[u + 1]] - begins[u])
-
-    found = mapped(mapper.config.threads, of_unit, range(units))
-    neighbours, going_on = (np.concatenate(each) for each in zip(*found, strict=True))
+    units = np.arange(len(mapper.registered) + 1)
+    begins, first = np.searchsorted(unit, units), np.searchsorted(unit[asked], units)
+    neighbours, going_on = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
+    in_parts(
+        even_bounds(len(units) - 1, mapper.config.threads),
+        lambda lo, hi, part: _count_in_units(points_m, goes_on, begins, asked, first, lo, hi, neighbours, going_on),
+    )
     return _Shares(track=track[asked], neighbours=neighbours, going_on=going_on), single
 
 
-def _around(points_m: Floats, goes_on: Bools, asked: Ints) -> tuple[Ints, Ints]:
-    """Neighbours and those of them that go on, around the points `asked` (n,) of all points (m, 3) of a unit."""
-    result = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
-    if len(asked):
-        axis = int(np.ptp(points_m, axis=0).argmax())
-        order = np.argsort(points_m[:, axis])
+@njit(cache=True, nogil=True)
+def _points_of_units(is_inlier: Any, of_keypoint: Any, unit_of_keypoint: Any, counted: Any) -> Any:
+    """Units (n,), ascending, and tracks (n,) of points that these observe, and in how many images (n,) each.
+
+    Keypoints are in the order of their units, so that one pass is enough.
+    """
+    size = len(is_inlier)
+    units, tracks, images = np.empty(size, np.int64), np.empty(size, np.int64), np.empty(size, np.int64)
+    entry, count = np.full(len(counted), -1, np.int64), 0
+    for k in range(size):
+        t = of_keypoint[k]
+        if not is_inlier[k] or not counted[t]:
+            continue
+        if entry[t] < 0 or units[entry[t]] != unit_of_keypoint[k]:
+            entry[t] = count
+            units[count], tracks[count], images[count] = unit_of_keypoint[k], t, 0
+            count += 1
+        images[entry[t]] += 1
+    return units[:count].copy(), tracks[:count].copy(), images[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _count_in_units(
+    points: Any, goes_on: Any, begins: Any, asked: Any, first: Any, lo: int, hi: int, neighbours: Any, going_on: Any
+) -> None:
+    """Count neighbours and those of them that go on, around the points `asked` (n,) of units lo..hi.
+
+    Points (m, 3) from begins[u], and those asked from first[u], are of unit u.
+    """
+    for u in range(lo, hi):
+        begin, end = begins[u], begins[u + 1]
+        if first[u] == first[u + 1]:
+            continue
+        own, axis, longest = points[begin:end], 0, -1.0
+        for i in range(3):
+            extent = own[:, i].max() - own[:, i].min()
+            if extent > longest:
+                axis, longest = i, extent
+        order = np.argsort(own[:, axis])
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        _count_around(points_m.take(order, axis=0), axis, goes_on.take(order), place.take(asked), *result)
-    return result
+        rows = slice(first[u], first[u + 1])
+        _count_around(
+            own[order], axis, goes_on[begin:end][order], place[asked[rows] - begin], neighbours[rows], going_on[rows]
+        )
 
 
 @njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mrasfm_engine.parallel import in_order
 from mrasfm_engine.types import Bools, Bytes, Floats
 from mrasfm_engine.visualization.ground import GroundTiles
 from mrasfm_engine.visualization.mosaic import MIN_CELL_M, RADIUS_M
@@ -35,6 +36,16 @@ class Cells:
     seen: int = 0
     left_out: int = 0
     single: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Prepared:
+    """A view before it is painted: the blocks that it may reach, and what hides them."""
+
+    index: int
+    reached: list[Block]
+    placed: PlacedView | None  # None where it sees no ground
+    hidden: Bools  # see `StandingPoints.hidden_from`
 
 
 @dataclass(kw_only=True)
@@ -71,22 +82,36 @@ class RoadPainter:
         self._store = BlockStore(self.folder)
         self._gains = RunningGains(self._cameras)
         self._left = Counter(block for view in self.views for block in self._reached(view))
+        self._prepared = in_order(1, self._prepare, range(len(self.views)))
         self._decider = ThreadPoolExecutor(1)
         self._undecided: deque[Future[None]] = deque()
 
     def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
         """Paint one view; see `views.Painter`."""
-        reached = self._reached(view)
-        placed = place_view(view, self.ground, margin_m=APRON_CELLS * MIN_CELL_M)
-        if placed is not None:
-            hidden = self.standing.hidden_from(index, placed)
-            shot = Shot(view=view, placed=placed, rgb=rgb, usable=usable, hidden=hidden, own_car_m=self.own_car_m)
-            self._add(shot, self._store.get([b for b in reached if _overlaps(b, placed)]))
-        for block in reached:
+        prepared = next(self._prepared)
+        assert prepared.index == index, "views come in order, and none is left out"
+        if prepared.placed is not None:
+            shot = Shot(
+                view=view,
+                placed=prepared.placed,
+                rgb=rgb,
+                usable=usable,
+                hidden=prepared.hidden,
+                own_car_m=self.own_car_m,
+            )
+            self._add(shot, self._store.get([b for b in prepared.reached if _overlaps(b, prepared.placed)]))
+        for block in prepared.reached:
             self._left[block] -= 1
             if not self._left[block]:
                 del self._left[block]
                 self._finish(block)
+
+    def _prepare(self, index: int) -> _Prepared:
+        """Do for a view what depends on no other one, while earlier ones are painted."""
+        view = self.views[index]
+        placed = place_view(view, self.ground, margin_m=APRON_CELLS * MIN_CELL_M)
+        hidden = np.zeros((0, 0), np.bool_) if placed is None else self.standing.hidden_from(index, placed)
+        return _Prepared(index=index, reached=self._reached(view), placed=placed, hidden=hidden)
 
     def finish(self) -> None:
         """Wait until all blocks are decided and written; raises what went wrong."""
@@ -96,6 +121,7 @@ class RoadPainter:
 
     def close(self) -> None:
         """End; blocks that nobody began to decide are left."""
+        self._prepared.close()
         self._decider.shutdown(cancel_futures=True)
 
     def _reached(self, view: View) -> list[Block]:

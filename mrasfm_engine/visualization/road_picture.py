@@ -66,7 +66,7 @@ def painting_road(plan: Plan, ground: GroundTiles, scratch: Path, own_car_m: Flo
             painter = RoadPainter(
                 views=plan.views,
                 ground=ground,
-                standing=StandingPoints(plan.points_m, plan.seen_by, plan.ground),
+                standing=StandingPoints(plan.points_m, plan.seen_by),
                 trajectory_m=plan.trajectory_m,
                 folder=scratch / BLOCKS,
                 tiles=tiles,

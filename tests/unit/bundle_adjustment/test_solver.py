@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment import solver
+from mrasfm_engine.bundle_adjustment.extrapolation import Extrapolation
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
@@ -63,14 +64,14 @@ def test_a_step_that_is_short_for_its_damping_is_no_convergence() -> None:
     assert 0 < position_errors_m(solution, best).max() < 1e-3
 
 
-def test_lengthened_steps_come_to_the_same_minimum_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_extrapolated_steps_come_to_the_same_minimum_sooner(monkeypatch: pytest.MonkeyPatch) -> None:
     # Errors beyond the scale of the loss, as in real images: there it is far less steep than its weights say.
     case = drive(noise_px=2.0)
     start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
     options = SolverOptions(function_tolerance=0.0, decrement_tolerance=1e-4, max_iterations=100)
     problem = replace(case.problem, state=start, options=options)
     solution, report = solve(problem)
-    monkeypatch.setattr(solver, "COSINES", (2.0, 3.0))
+    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
     as_they_are, slower = solve(problem)
     assert report.termination is slower.termination is Termination.CONVERGED
     assert report.iterations <= 0.8 * slower.iterations
@@ -78,31 +79,58 @@ def test_lengthened_steps_come_to_the_same_minimum_sooner(monkeypatch: pytest.Mo
     assert 0 < position_errors_m(solution, as_they_are).max() < 0.05 * position_errors_m(solution, case.truth).max()
 
 
-def test_a_step_is_lengthened_by_the_rest_of_its_series() -> None:
+def test_steps_that_shrink_by_their_own_factors_are_extrapolated_to_where_they_end() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
-    information = root @ root.T
-    first = rng.normal(size=6)
-    before = solver._Direction(gradient=-information @ first, decrement=float(first @ information @ first))
+    taken_for = root @ root.T  # the normal equations, which take the cost for steeper than it is
+    values, vectors = np.linalg.eigh(taken_for)
+    half = vectors @ np.diag(np.sqrt(values))
+    turn = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    information = half @ turn @ np.diag([1.0, 1.0, 0.9, 0.9, 0.3, 0.3]) @ turn.T @ half.T
+    start = rng.normal(size=6)
 
-    def factor(step: np.ndarray) -> float:
-        return before.factor_of(step, float(step @ information @ step))
+    def off(course: Extrapolation | None, steps: int) -> float:
+        at = start
+        for _ in range(steps):
+            gradient = information @ at
+            step = -np.linalg.solve(taken_for, gradient)
+            way = step if course is None else course.way_of(step, gradient)
+            if course is not None:
+                course.remember(step, gradient, way)
+            at = at + way
+        return float(at @ information @ at)
 
-    np.testing.assert_allclose(factor(0.6 * first), 2.5)  # 1 + 0.6 + 0.36 + ...
-    np.testing.assert_allclose(factor(1.3 * first), 8.0)  # no series that ends
-    assert factor(-0.6 * first) == 1.0
-    other = rng.normal(size=6)
-    other -= first * float(other @ information @ first) / before.decrement
-    assert factor(other) == 1.0
+    # Three factors are known after three steps.
+    assert off(Extrapolation(), 4) < 1e-12 * off(None, 0)
+    assert off(None, 4) > 0.01 * off(None, 0)
 
 
-def test_a_lengthened_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("rate", [-0.5, 0.6, 0.95, 1.0, 1.3])
+def test_a_step_is_extrapolated_where_its_series_ends(rate: float) -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    information, first = root @ root.T, rng.normal(size=6)
+    course = Extrapolation()
+    gradient = -information @ first
+    assert course.way_of(first, gradient) is first
+    course.remember(first, gradient, first)
+    way = course.way_of(rate * first, rate * gradient)
+    # 1 + rate + rate^2 + ... of steps that shrink; of others two tell little.
+    np.testing.assert_allclose(way, rate * first / (1.0 - rate) if rate < 0.9 else rate * first)
+
+
+def test_an_extrapolated_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     case = drive(noise_px=0.5)
     start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
     factors = iter([100.0])
-    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: 1.0)
+    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
     plain, of_plain = solve(replace(case.problem, state=start))
-    monkeypatch.setattr(solver._Direction, "factor_of", lambda self, step, decrement: next(factors, 1.0))
+
+    def too_far(self: Extrapolation, step: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        factor = next(factors, None)
+        return step if factor is None else factor * step
+
+    monkeypatch.setattr(Extrapolation, "way_of", too_far)
     solution, report = solve(replace(case.problem, state=start))
     assert next(factors, None) is None
     # No damping was raised for it, and no step taken back.
@@ -120,7 +148,8 @@ def test_what_is_left_after_a_step_is_the_rest_of_its_series(rate: float) -> Non
 
 @pytest.mark.parametrize("seed", range(4))
 def test_an_adjustment_ends_as_soon_as_little_is_left(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(solver, "COSINES", (2.0, 3.0))  # a lengthened step tells nothing of the next one
+    # An extrapolated step tells nothing of the next one.
+    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
     case = drive(noise_px=0.5, seed=seed)
     start = perturbed(case.truth, np.random.default_rng(seed), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
     options = SolverOptions(function_tolerance=0.0, decrement_tolerance=0.1, expects_rest=True, sigma_px=0.5)

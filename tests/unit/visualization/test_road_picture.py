@@ -61,7 +61,7 @@ def road_painter(
     return RoadPainter(
         views=views,
         ground=GroundTiles(Level()),
-        standing=StandingPoints(standing_m, [np.arange(len(standing_m))] * len(views), Level()),
+        standing=StandingPoints(standing_m, [np.arange(len(standing_m))] * len(views)),
         trajectory_m=np.array([view.plan_from_cam[1][:2, 3] for view in views]),
         folder=folder / BLOCKS,
         tiles=TileFile(folder / TILES),
@@ -174,7 +174,7 @@ def test_things_that_stand_hide_the_ground_behind_them(tmp_path: Path) -> None:
     placed = place_view(view, ground)
     assert placed is not None
     assert placed.above_ground_m == pytest.approx(HEIGHT_M)
-    hidden = StandingPoints(post, [np.arange(5)], Level()).hidden_from(0, placed)
+    hidden = StandingPoints(post, [np.arange(5)]).hidden_from(0, placed)
     ahead = hidden[SIDE // 2, SIDE // 2 :]
     at_m = np.flatnonzero(ahead) * STEP_M
     # The ray over a thing half as high as the camera meets the ground at twice its distance.
