@@ -380,9 +380,9 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
         if step is not None:
-            way = step
-            if damping <= MAX_DAMPING_OF_DECREMENT:
-                way = problem.extrapolated(state, course.way_of(step, system.gradient), step)
+            if damping > MAX_DAMPING_OF_DECREMENT:
+                course.forget()  # how long a step is that damping holds back tells nothing of others
+            way = problem.extrapolated(state, course.way_of(step, system.gradient), step)
             trial, trial_costs, trial_cost = problem.after(state, costs, system, way)
             if way is not step and not trial_cost < cost:
                 course.forget()

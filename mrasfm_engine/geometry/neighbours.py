@@ -12,7 +12,6 @@ from mrasfm_engine.jit import njit
 from mrasfm_engine.parallel import in_ranges
 from mrasfm_engine.types import Floats, Ints
 
-
 FEW = 200  # places, among which looking at every one is faster than a search tree
 
 

@@ -134,7 +134,7 @@ def _linearise(count: int, unknowns: int, p: Any, sight: Any, views: Any, loss: 
 @uncounted()
 def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views: Any, scratch: Any) -> float:
     """Cost of the observations of a point that stands at x, y, z from the reference camera."""
-    r, offset, out, total = views.rotation, sight.offset_m, scratch.projected, 0.0
+    r, offset, out, total, product = views.rotation, sight.offset_m, scratch.projected, 0.0, 1.0
     loss2 = LOSS_SIGMAS * LOSS_SIGMAS
     for m in range(count):
         k, c = sight.band[m], sight.camera[m]
@@ -146,8 +146,11 @@ def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views
         ):  # fmt: skip
             return np.inf
         squared = ((out[0] - sight.xy_px[m, 0]) ** 2 + (out[1] - sight.xy_px[m, 1]) ** 2) / views.sigma_px[c] ** 2
-        total += loss2 * math.log(1.0 + squared / loss2)
-    return total
+        product *= 1.0 + squared / loss2
+        if product > 1e200:  # one logarithm for many factors
+            total += loss2 * math.log(product)
+            product = 1.0
+    return total + loss2 * math.log(product)
 
 
 @uncounted()

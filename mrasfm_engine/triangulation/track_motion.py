@@ -158,6 +158,14 @@ def _begin_of_window(members: Any, band: Any, views: Any) -> tuple[float, int]:
     that some more or fewer may be in that time.
     """
     most, begin_s, seen, first = 0, 0.0, 0, 0
+    earliest_s, latest_s = np.inf, -np.inf
+    for k in members:
+        if views.is_posed[band[k]]:
+            earliest_s, latest_s = min(earliest_s, views.time_s[band[k]]), max(latest_s, views.time_s[band[k]])
+            seen += 1
+    if not latest_s - earliest_s > WINDOW_S:  # as most are
+        return earliest_s, seen
+    seen = 0
     for i in range(len(members)):
         if not views.is_posed[band[members[i]]]:
             continue

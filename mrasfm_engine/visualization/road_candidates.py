@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -89,12 +90,24 @@ class Candidates:
             place=np.zeros(shape, np.uint16),
         )
 
-    def within(self, placed: PlacedView, cell_m: float) -> Ints:
-        """Cells that a view may see: [first row, row after the last, first column, column after the last]."""
-        rows = np.array([-placed.high_m[1], -placed.low_m[1]]) / cell_m - self.row
-        columns = np.array([placed.low_m[0], placed.high_m[0]]) / cell_m - self.column
+    def within(self, placed: PlacedView, cell_m: float, margin: int = 0) -> Ints | None:
+        """Cells that a view may see: [first row, row after the last, first column, column after the last].
+
+        None where there are none. Those within `margin` of the border do not count.
+        """
+        (left_m, bottom_m), (right_m, top_m) = placed.low_m.tolist(), placed.high_m.tolist()
         height, width = self.count.shape
-        return np.concatenate([np.clip(rows, 0, height), np.clip(columns, 0, width)]).astype(np.int64)
+        rows, columns = (margin, height - margin), (margin, width - margin)
+        first_row, last_row = (_clipped(-y / cell_m - self.row, *rows) for y in (top_m, bottom_m))
+        first_column, last_column = (_clipped(x / cell_m - self.column, *columns) for x in (left_m, right_m))
+        if first_row >= last_row or first_column >= last_column:
+            return None
+        return np.array([first_row, last_row, first_column, last_column])
+
+
+def _clipped(value: float, low: int, high: int) -> int:
+    """The whole number below, within bounds; plain numbers, as numpy's take most of the time for so few."""
+    return int(min(max(value, low), high))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,8 +121,9 @@ class Shot:
     hidden: Bools  # see `StandingPoints.hidden_from`
     own_car_m: Floats | None
 
+    @cached_property
     def arguments(self) -> tuple[Any, ...]:
-        """Arguments that both kernels share."""
+        """Arguments that both kernels share, for every block."""
         return (
             self.rgb,
             np.ones((1, 1), np.bool_) if self.usable is None else self.usable,
@@ -129,11 +143,11 @@ class Shot:
 def add_view(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float) -> int:
     """Add a view to the cells where it is among the best, with factors (3,) on its colours; to how many cells."""
     bounds = candidates.within(shot.placed, cell_m)
-    if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
+    if bounds is None:
         return 0
     return int(
         _add(
-            *shot.arguments(),
+            *shot.arguments,
             gain,
             shot.view.place,
             cell_m,
@@ -154,16 +168,13 @@ def log_ratios(candidates: Candidates, shot: Shot, gain: Floats, cell_m: float, 
 
     Of every few cells, those within `margin` of the border left out: they belong to another block as well.
     """
-    bounds = candidates.within(shot.placed, cell_m)
-    bounds = np.concatenate(
-        [np.clip(b, margin, side - margin) for b, side in zip(np.split(bounds, 2), candidates.count.shape, strict=True)]
-    )
-    if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
+    bounds = candidates.within(shot.placed, cell_m, margin)
+    if bounds is None:
         return np.zeros(0)
     rows, columns = (math.ceil((bounds[k] - bounds[j]) / COMPARED_CELLS) + 1 for j, k in ((0, 1), (2, 3)))
     found = np.empty(rows * columns)
     count = _ratios(
-        *shot.arguments(),
+        *shot.arguments,
         gain,
         cell_m,
         candidates.row,

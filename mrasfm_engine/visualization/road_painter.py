@@ -99,7 +99,7 @@ class RoadPainter:
                 hidden=prepared.hidden,
                 own_car_m=self.own_car_m,
             )
-            self._add(shot, self._store.get([b for b in prepared.reached if _overlaps(b, prepared.placed)]))
+            self._add(shot, self._store.get(_overlapping(prepared.reached, prepared.placed)))
         for block in prepared.reached:
             self._left[block] -= 1
             if not self._left[block]:
@@ -153,9 +153,13 @@ class RoadPainter:
         self.tiles.add(TileIndex(0, *block), np.dstack([found.color[inside] * agreed[..., None], opacity]))
 
 
-def _overlaps(block: Block, placed: PlacedView) -> bool:
-    """Return whether a view's footprint meets a block."""
+def _overlapping(blocks: Sequence[Block], placed: PlacedView) -> list[Block]:
+    """Those of the blocks that a view's footprint meets."""
     side_m, apron_m = TILE_CELLS * MIN_CELL_M, APRON_CELLS * MIN_CELL_M
-    low, high = placed.low_m - apron_m, placed.high_m + apron_m
-    rows = -(block[0] + 1) * side_m < high[1] and -block[0] * side_m > low[1]
-    return bool(rows and block[1] * side_m < high[0] and (block[1] + 1) * side_m > low[0])
+    (left_m, bottom_m), (right_m, top_m) = (placed.low_m - apron_m).tolist(), (placed.high_m + apron_m).tolist()
+    return [
+        (row, column)
+        for row, column in blocks
+        if -(row + 1) * side_m < top_m and -row * side_m > bottom_m
+        if column * side_m < right_m and (column + 1) * side_m > left_m
+    ]

@@ -103,3 +103,24 @@ def test_covariance_grows_with_the_noise(case: Case) -> None:
     )
     assert (np.diagonal(fine, axis1=1, axis2=2) > 0).all()
     assert (np.diagonal(fine, axis1=1, axis2=2) < np.diagonal(coarse, axis1=1, axis2=2)).all()
+
+
+def test_a_sum_of_steps_is_made_a_step_of_rigid_sets(case: Case) -> None:
+    problem, rng = with_sets(case), np.random.default_rng(0)
+    assert problem.sets is not None
+
+    def by_unit(state: State, step: np.ndarray) -> np.ndarray:
+        of, maps = problem.sets.unit_from_set_steps(state, problem.layout)
+        return np.einsum("nij,nj->ni", maps, step.reshape(2, 6)[of]).ravel()
+
+    first, second = rng.normal(size=(2, 12)) * 0.01
+    own = by_unit(case.truth, first)
+    np.testing.assert_allclose(problem.sets.nearest_step(case.truth, problem.layout, own), own, atol=1e-12)
+    later = moved(problem, case.truth, first)
+    together = own + by_unit(later, second)
+    rigid = problem.sets.nearest_step(later, problem.layout, together)
+    assert 0.0 < np.abs(rigid - together).max() < 0.05 * np.abs(together).max()
+    after = problem.retract(later, rigid, later.points_m)
+    for units in (OF_UNIT == 0, OF_UNIT == 1):
+        before_m, after_m = (np.linalg.norm(np.diff(s.unit_position_m[units], axis=0), axis=1) for s in (later, after))
+        np.testing.assert_allclose(after_m, before_m, atol=1e-12)
