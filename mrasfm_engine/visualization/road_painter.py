@@ -154,7 +154,7 @@ class RoadPainter:
 
 
 def _overlapping(blocks: Sequence[Block], placed: PlacedView) -> list[Block]:
-    """Those of the blocks that a view's footprint meets."""
+    """Blocks that a view's footprint meets."""
     side_m, apron_m = TILE_CELLS * MIN_CELL_M, APRON_CELLS * MIN_CELL_M
     (left_m, bottom_m), (right_m, top_m) = (placed.low_m - apron_m).tolist(), (placed.high_m + apron_m).tolist()
     return [
