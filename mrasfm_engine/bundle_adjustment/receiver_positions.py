@@ -262,7 +262,7 @@ class ReceiverPositions:
         return self._information_and_common(columns)[0]
 
     def _information_and_common(self, columns: Floats) -> tuple[Floats, Floats]:
-        """The same, and I + C' C (c, c) of the errors that positions have in common, with what wanders in C."""
+        """The same, and I + K' C^-1 K (c, c) of the ways K in which common errors move positions, C without these."""
         count = columns.shape[2]
         known = self._information_by_process(np.concatenate([columns, self.common_m], axis=2))
         of_common = np.eye(known.shape[0] - count) + known[count:, count:]

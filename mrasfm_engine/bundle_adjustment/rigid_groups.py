@@ -103,8 +103,11 @@ class RigidGroups:
         result: Floats = np.einsum("nij,nj->ni", maps, step.reshape(-1, UNIT_DOF)[of]).ravel()
         return result if np.isfinite(result).all() else None
 
-    def nearest_step(self, state: State, layout: Layout, step: Floats) -> Floats:
-        """The step (6 units,) of rigid sets that is nearest to one of units, as a sum of steps from other states is."""
+    def mean_step(self, state: State, layout: Layout, step: Floats) -> Floats:
+        """The step (6 units,) of the sets that is the mean of what units want whose turns are those of their sets.
+
+        A sum of steps from several states is such a step: the arms of its shifts are of other states than its own.
+        """
         of, maps = self.unit_from_set_steps(state, layout)
         back = np.linalg.inv(maps) @ step.reshape(-1, UNIT_DOF, 1)
         mean = np.zeros((self.count, UNIT_DOF))

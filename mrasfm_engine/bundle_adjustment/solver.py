@@ -12,8 +12,8 @@ from functools import cached_property
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
+from mrasfm_engine.bundle_adjustment.anderson_acceleration import AndersonAcceleration
 from mrasfm_engine.bundle_adjustment.back_substitution import add_scores, substitute
-from mrasfm_engine.bundle_adjustment.extrapolation import Extrapolation
 from mrasfm_engine.bundle_adjustment.image_sums import add_images, num_image_sums
 from mrasfm_engine.bundle_adjustment.kernels import Bands, Loss, Motion, Observed, Slots, Views, squared_errors
 from mrasfm_engine.bundle_adjustment.point_elimination import Sums, accumulate
@@ -51,9 +51,9 @@ class SolverOptions:
     # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that move
     # between their robust weights, which moves no pose.
     decrement_tolerance: float = 5e-3
-    # Whether what the last two steps let expect of all further ones may be as small, instead of the last step itself.
-    # Along a flat direction it goes on for longer than these show: only where further adjustments follow, and of many
-    # units.
+    # Whether what two steps that were applied as they are let expect of all further ones may be as small, instead of
+    # the last step itself. Along a flat direction it goes on for longer than these show: only where further adjustments
+    # follow, and of many units.
     expects_rest: bool = False
     initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
@@ -250,9 +250,15 @@ class Problem:
         """The damped step (n,) of the reduced vector; None where there is none."""
         return system.step(damping) if self.sets is None else self.sets.step(system, state, damping)
 
-    def extrapolated(self, state: State, way: Floats, step: Floats) -> Floats:
-        """The way (n,) to go for a step (n,), as `step` may make one; the step itself where that is the way."""
-        return way if self.sets is None or way is step else self.sets.nearest_step(state, self.layout, way)
+    def accelerated(
+        self, state: State, acceleration: AndersonAcceleration, step: Floats, system: ReducedCameraSystem
+    ) -> Floats:
+        """The update (n,) for a step (n,) by the iterations before; the step itself where these tell nothing of it."""
+        update = acceleration.update_for(step, system.gradient)
+        if self.sets is None or update is step:
+            return update
+        update = self.sets.mean_step(state, self.layout, update)
+        return update if float(update @ system.gradient) < 0.0 else step
 
     @property
     def unknowns(self) -> int:
@@ -332,7 +338,7 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     -----
     Damping follows Madsen, Nielsen and Tingleff, "Methods for Non-Linear Least Squares Problems" (2004), section 3.2.
 
-    Steps are extrapolated, see `extrapolation`; where that costs more, the step is taken as it is.
+    Updates are accelerated, see `anderson_acceleration`; instead of one that costs more, the step is applied as it is.
     """
     if problem.layout.size < SMALL_SYSTEM:
         with _THREADS.limit(limits=1, user_api="blas"):
@@ -369,8 +375,8 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     free = problem.unknowns
     if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
-    course, is_flat = Extrapolation(), False
-    as_it_is = 0.0  # decrement of the step before, where neither extrapolation nor damping changed it
+    acceleration, is_flat = AndersonAcceleration(), False
+    as_it_is = 0.0  # decrement of the step before, where neither acceleration nor damping changed it
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
@@ -380,17 +386,18 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
         if step is not None:
-            if damping > MAX_DAMPING_OF_DECREMENT:
-                course.forget()  # how long a step is that damping holds back tells nothing of others
-            way = problem.extrapolated(state, course.way_of(step, system.gradient), step)
-            trial, trial_costs, trial_cost = problem.after(state, costs, system, way)
-            if way is not step and not trial_cost < cost:
-                course.forget()
-                way = step
+            # How long a step is that damping holds back tells nothing of others.
+            is_held_back = damping > MAX_DAMPING_OF_DECREMENT
+            update = step if is_held_back or is_flat else problem.accelerated(state, acceleration, step, system)
+            trial, trial_costs, trial_cost = problem.after(state, costs, system, update)
+            if update is not step and not trial_cost < cost:
+                acceleration.clear()
+                update = step
                 trial, trial_costs, trial_cost = problem.after(state, costs, system, step)
-            course.remember(step, system.gradient, way)
+            if not is_held_back:
+                acceleration.record(step, system.gradient, update)
         if step is None or not trial_cost < cost:
-            course.forget()
+            acceleration.clear()
             as_it_is, is_flat = 0.0, False
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
@@ -398,10 +405,10 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        as_it_is = decrement if way is step and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
-        # An extrapolated step may end as high on the other side of the minimum: one more tells.
-        was_flat, is_flat = is_flat, cost - trial_cost <= options.function_tolerance * cost
-        if (is_flat and (was_flat or way is step)) or (
+        as_it_is = decrement if update is step and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
+        is_flat = cost - trial_cost <= options.function_tolerance * cost
+        # An accelerated update may end as high on the other side of the minimum: the next step is applied as it is.
+        if (is_flat and update is step) or (
             # A step that damping holds back is short wherever the minimum is.
             free and damping <= MAX_DAMPING_OF_DECREMENT and left <= options.decrement_tolerance
         ):

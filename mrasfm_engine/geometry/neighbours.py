@@ -21,21 +21,32 @@ def nearest(
     """Distances and indices (n, count), nearest first, of the places (k, d), k > 0, around each of positions (n, d).
 
     Where there are fewer within the distance, the distance is infinite and the index 0.
+
+    Raises
+    ------
+    ValueError
+        Where a coordinate is not finite.
     """
     count = min(count, len(places_m))
-    if count == 1 and len(places_m) <= FEW:
-        distance, index = np.empty((len(positions_m), 1)), np.empty((len(positions_m), 1), dtype=np.int64)
-        places_m, positions_m = np.ascontiguousarray(places_m.T), np.ascontiguousarray(positions_m)
-        in_ranges(
-            threads,
-            len(positions_m),
-            lambda lo, hi: _find_nearest(places_m, positions_m[lo:hi], within_m, distance[lo:hi], index[lo:hi]),
-        )
-        return distance, index
+    if count == 1 and len(places_m) <= FEW and places_m.shape[1] == positions_m.shape[1]:
+        return _nearest_of_few(places_m, positions_m, float(within_m), threads)
     found = cKDTree(places_m).query(positions_m, k=count, distance_upper_bound=within_m, workers=threads)
     distance = np.asarray(found[0], dtype=np.float64).reshape(len(positions_m), count)
     index = np.asarray(found[1], dtype=np.int64).reshape(len(positions_m), count)
     return distance, np.where(np.isfinite(distance), index, 0)
+
+
+def _nearest_of_few(places_m: Floats, positions_m: Floats, within_m: float, threads: int) -> tuple[Floats, Ints]:
+    places, positions = (np.ascontiguousarray(a, dtype=np.float64) for a in (places_m.T, positions_m))
+    if not (np.isfinite(places).all() and np.isfinite(positions).all()):
+        raise ValueError("a coordinate is not finite")
+    distance, index = np.empty((len(positions), 1)), np.empty((len(positions), 1), dtype=np.int64)
+    in_ranges(
+        threads,
+        len(positions),
+        lambda lo, hi: _find_nearest(places, positions[lo:hi], within_m, distance[lo:hi], index[lo:hi]),
+    )
+    return distance, index
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from mrasfm_engine.bundle_adjustment.marginal_covariances import (
 )
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, ReadoutPrior, ScalePrior, Term
-from mrasfm_engine.bundle_adjustment.problem import INTRINSICS, UNIT_DOF
+from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
@@ -42,9 +42,6 @@ from schemas.findings import Finding
 LARGEST_SIGMA_M = 30.0
 TOLERANCE = 1e-6
 DECREMENT_TOLERANCE = 0.1  # of the last step of the last round: less than half a standard deviation of all together
-# The same for each unknown, to at most one standard deviation of all together: points that move between their robust
-# weights shake all poses by as little, and no further step ends that.
-DECREMENT_AN_UNKNOWN, MOST_DECREMENT = 1e-4, 0.5
 ROUGH_DECREMENT_TOLERANCE = 1.0  # in those before, after which observations change anyway
 INITIAL_DAMPING = 1e-6  # scale is a weak direction, which damping holds up: it must arrive as well
 
@@ -117,11 +114,10 @@ def solver_options(mapper: Mapper, result: Refinement, *, rough: bool = False) -
 
     What observations share takes weight from all of them beside the priors. In pixels their loss stays as it is.
     """
-    shaken = min(DECREMENT_AN_UNKNOWN * UNIT_DOF * int(mapper.registered.sum()), MOST_DECREMENT)
     return SolverOptions(
         max_iterations=15 if rough else 40,
         function_tolerance=TOLERANCE,
-        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else max(DECREMENT_TOLERANCE, shaken),
+        decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
         initial_damping=INITIAL_DAMPING,
         loss_scale=mapper.config.bundle_adjustment.loss_scale / result.sigma_factor,
         sigma_px=result.sigma_px * result.sigma_factor,

@@ -127,7 +127,7 @@ def _neighbourhoods(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[_Sh
     begins, first = np.searchsorted(unit, units), np.searchsorted(unit[asked], units)
     neighbours, going_on = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
     in_parts(
-        even_bounds(len(units) - 1, mapper.config.threads),
+        np.searchsorted(first, even_bounds(len(asked), mapper.config.threads)),
         lambda lo, hi, part: _count_in_units(points_m, goes_on, begins, asked, first, lo, hi, neighbours, going_on),
     )
     return _Shares(track=track[asked], neighbours=neighbours, going_on=going_on), single

@@ -154,8 +154,8 @@ def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
 def _begin_of_window(members: Any, band: Any, views: Any) -> tuple[float, int]:
     """Begin of the time in which most of a track's observations are, and about how many these are.
 
-    Keypoints are in the order of their units, so that one pass is enough. Cameras of one unit may be in any order, so
-    that some more or fewer may be in that time.
+    Keypoints are in the order of their units, so that a window that moves along them is enough. Cameras of one unit may
+    be in any order, so that some more or fewer may be in that time.
     """
     most, begin_s, seen, first = 0, 0.0, 0, 0
     earliest_s, latest_s = np.inf, -np.inf

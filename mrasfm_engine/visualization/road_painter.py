@@ -121,8 +121,8 @@ class RoadPainter:
 
     def close(self) -> None:
         """End; blocks that nobody began to decide are left."""
-        self._prepared.close()
         self._decider.shutdown(cancel_futures=True)
+        self._prepared.close()
 
     def _reached(self, view: View) -> list[Block]:
         return self._plan.reached(view.plan_from_cam[REFINED][:2, 3], VIEW_M)

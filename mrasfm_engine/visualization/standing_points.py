@@ -51,7 +51,7 @@ class StandingPoints:
         return hidden
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _hide_by_points(
     points: Any, seen: Any, centre: Any, camera_above: float, heights: Any, first: Any, hidden: Any
 ) -> None:

@@ -49,7 +49,10 @@ class Painter(Protocol):
     """Something that takes images one after the other."""
 
     def paint(self, index: int, view: View, rgb: Bytes, usable: Bools | None) -> None:
-        """Take a view, by its position in the sequence, with its image (h, w, 3) and usable pixels (h, w)."""
+        """Take a view, by its position in the sequence, with its image (h, w, 3) and usable pixels (h, w).
+
+        Views come in the order of the sequence, each of them once.
+        """
         ...
 
 

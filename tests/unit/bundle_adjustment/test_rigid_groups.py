@@ -115,10 +115,10 @@ def test_a_sum_of_steps_is_made_a_step_of_rigid_sets(case: Case) -> None:
 
     first, second = rng.normal(size=(2, 12)) * 0.01
     own = by_unit(case.truth, first)
-    np.testing.assert_allclose(problem.sets.nearest_step(case.truth, problem.layout, own), own, atol=1e-12)
+    np.testing.assert_allclose(problem.sets.mean_step(case.truth, problem.layout, own), own, atol=1e-12)
     later = moved(problem, case.truth, first)
     together = own + by_unit(later, second)
-    rigid = problem.sets.nearest_step(later, problem.layout, together)
+    rigid = problem.sets.mean_step(later, problem.layout, together)
     assert 0.0 < np.abs(rigid - together).max() < 0.05 * np.abs(together).max()
     after = problem.retract(later, rigid, later.points_m)
     for units in (OF_UNIT == 0, OF_UNIT == 1):

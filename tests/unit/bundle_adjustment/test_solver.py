@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrasfm_engine.bundle_adjustment import solver
-from mrasfm_engine.bundle_adjustment.extrapolation import Extrapolation
+from mrasfm_engine.bundle_adjustment.anderson_acceleration import MAX_FACTOR, AndersonAcceleration
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior
 from mrasfm_engine.bundle_adjustment.problem import Layout, Observations
 from mrasfm_engine.bundle_adjustment.solver import Problem, SolverOptions, Termination, solve
@@ -71,7 +71,7 @@ def test_extrapolated_steps_come_to_the_same_minimum_sooner(monkeypatch: pytest.
     options = SolverOptions(function_tolerance=0.0, decrement_tolerance=1e-4, max_iterations=100)
     problem = replace(case.problem, state=start, options=options)
     solution, report = solve(problem)
-    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
+    monkeypatch.setattr(AndersonAcceleration, "update_for", lambda self, step, gradient: step)
     as_they_are, slower = solve(problem)
     assert report.termination is slower.termination is Termination.CONVERGED
     assert report.iterations <= 0.8 * slower.iterations
@@ -89,19 +89,19 @@ def test_steps_that_shrink_by_their_own_factors_are_extrapolated_to_where_they_e
     information = half @ turn @ np.diag([1.0, 1.0, 0.9, 0.9, 0.3, 0.3]) @ turn.T @ half.T
     start = rng.normal(size=6)
 
-    def off(course: Extrapolation | None, steps: int) -> float:
+    def off(acceleration: AndersonAcceleration | None, steps: int) -> float:
         at = start
         for _ in range(steps):
             gradient = information @ at
             step = -np.linalg.solve(taken_for, gradient)
-            way = step if course is None else course.way_of(step, gradient)
-            if course is not None:
-                course.remember(step, gradient, way)
-            at = at + way
+            update = step if acceleration is None else acceleration.update_for(step, gradient)
+            if acceleration is not None:
+                acceleration.record(step, gradient, update)
+            at = at + update
         return float(at @ information @ at)
 
-    # Three factors are known after three steps.
-    assert off(Extrapolation(), 4) < 1e-12 * off(None, 0)
+    # The first step leaves nothing of one direction in three; the factors of the others are known after two more.
+    assert off(AndersonAcceleration(), 4) < 1e-12 * off(None, 0)
     assert off(None, 4) > 0.01 * off(None, 0)
 
 
@@ -110,27 +110,52 @@ def test_a_step_is_extrapolated_where_its_series_ends(rate: float) -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
     information, first = root @ root.T, rng.normal(size=6)
-    course = Extrapolation()
+    acceleration = AndersonAcceleration()
     gradient = -information @ first
-    assert course.way_of(first, gradient) is first
-    course.remember(first, gradient, first)
-    way = course.way_of(rate * first, rate * gradient)
+    assert acceleration.update_for(first, gradient) is first
+    acceleration.record(first, gradient, first)
+    update = acceleration.update_for(rate * first, rate * gradient)
     # 1 + rate + rate^2 + ... of steps that shrink; of others two tell little.
-    np.testing.assert_allclose(way, rate * first / (1.0 - rate) if rate < 0.9 else rate * first)
+    np.testing.assert_allclose(update, rate * first / (1.0 - rate) if rate < 0.9 else rate * first)
+
+
+def test_updates_do_not_grow_beyond_a_few_steps() -> None:
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    information, step = root @ root.T, rng.normal(size=6)
+    acceleration, factors = AndersonAcceleration(), list[float]()
+    for _ in range(8):  # of steps that shrink whatever is applied
+        gradient = -information @ step
+        update = acceleration.update_for(step, gradient)
+        acceleration.record(step, gradient, update)
+        factors.append(float(update @ step) / float(step @ step))
+        step = 0.86 * step
+    assert factors[0] == 1.0
+    assert 5.0 < max(factors) <= MAX_FACTOR
+
+
+def test_steps_that_damping_holds_back_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    case = drive(noise_px=0.5)
+    start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
+    kept = list[np.ndarray]()
+    monkeypatch.setattr(AndersonAcceleration, "record", lambda self, step, gradient, update: kept.append(step))
+    options = SolverOptions(initial_damping=4.0 * solver.MAX_DAMPING_OF_DECREMENT)
+    _, report = solve(replace(case.problem, state=start, options=options))
+    assert len(kept) == report.iterations - 1 > 1
 
 
 def test_an_extrapolated_step_that_costs_more_is_taken_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     case = drive(noise_px=0.5)
     start = perturbed(case.truth, np.random.default_rng(1), units=range(1, 8))
     factors = iter([100.0])
-    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
+    monkeypatch.setattr(AndersonAcceleration, "update_for", lambda self, step, gradient: step)
     plain, of_plain = solve(replace(case.problem, state=start))
 
-    def too_far(self: Extrapolation, step: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    def too_far(self: AndersonAcceleration, step: np.ndarray, gradient: np.ndarray) -> np.ndarray:
         factor = next(factors, None)
         return step if factor is None else factor * step
 
-    monkeypatch.setattr(Extrapolation, "way_of", too_far)
+    monkeypatch.setattr(AndersonAcceleration, "update_for", too_far)
     solution, report = solve(replace(case.problem, state=start))
     assert next(factors, None) is None
     # No damping was raised for it, and no step taken back.
@@ -149,7 +174,7 @@ def test_what_is_left_after_a_step_is_the_rest_of_its_series(rate: float) -> Non
 @pytest.mark.parametrize("seed", range(4))
 def test_an_adjustment_ends_as_soon_as_little_is_left(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     # An extrapolated step tells nothing of the next one.
-    monkeypatch.setattr(Extrapolation, "way_of", lambda self, step, gradient: step)
+    monkeypatch.setattr(AndersonAcceleration, "update_for", lambda self, step, gradient: step)
     case = drive(noise_px=0.5, seed=seed)
     start = perturbed(case.truth, np.random.default_rng(seed), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
     options = SolverOptions(function_tolerance=0.0, decrement_tolerance=0.1, expects_rest=True, sigma_px=0.5)
