@@ -9,6 +9,7 @@ acceleration for fixed-point iterations, SIAM Journal on Numerical Analysis 2011
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -43,15 +44,15 @@ class _Iteration:
 class AndersonAcceleration:
     """The last iterations of a solve, and the updates that follow from them."""
 
-    history: list[_Iteration] = field(default_factory=list)
+    history: deque[_Iteration] = field(default_factory=lambda: deque(maxlen=DEPTH))
 
     def record(self, step: Floats, gradient: Floats, update: Floats) -> None:
         """Keep an iteration: its step (n,), the gradient of that, and the update that was applied."""
-        self.history = [*self.history, _Iteration(step=step, gradient=gradient, update=update)][-DEPTH:]
+        self.history.append(_Iteration(step=step, gradient=gradient, update=update))
 
     def clear(self) -> None:
         """Drop all iterations."""
-        self.history = []
+        self.history.clear()
 
     def update_for(self, step: Floats, gradient: Floats) -> Floats:
         """The update (n,) for a step (n,): the step itself where the history tells nothing of it.

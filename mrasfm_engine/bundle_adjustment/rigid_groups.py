@@ -100,7 +100,7 @@ class RigidGroups:
         except (np.linalg.LinAlgError, ValueError):
             return None
         of, maps = self.unit_from_set_steps(state, system.layout)
-        result: Floats = np.einsum("nij,nj->ni", maps, step.reshape(-1, UNIT_DOF)[of]).ravel()
+        result = _of_units(of, maps, step.reshape(-1, UNIT_DOF))
         return result if np.isfinite(result).all() else None
 
     def mean_step(self, state: State, layout: Layout, step: Floats) -> Floats:
@@ -112,8 +112,7 @@ class RigidGroups:
         back = np.linalg.inv(maps) @ step.reshape(-1, UNIT_DOF, 1)
         mean = np.zeros((self.count, UNIT_DOF))
         np.add.at(mean, of, back[..., 0] / np.bincount(of, minlength=self.count)[of, None])
-        result: Floats = np.einsum("nij,nj->ni", maps, mean[of]).ravel()
-        return result
+        return _of_units(of, maps, mean)
 
     def retract(self, state: State, layout: Layout, step: Floats, points_m: Floats) -> State:
         """The state after a step (6 units,) that `step` made: every set moved as the rigid body that it is."""
@@ -145,3 +144,9 @@ class RigidGroups:
         blocks = inverse.reshape(self.count, UNIT_DOF, self.count, UNIT_DOF)
         result: Floats = np.ascontiguousarray(np.swapaxes(blocks, 1, 2)[on, on])
         return result
+
+
+def _of_units(set_of_unit: Ints, maps: Floats, steps: Floats) -> Floats:
+    """Steps (6 n,) of units by those of their sets (sets, 6), see `RigidGroups.unit_from_set_steps`."""
+    result: Floats = np.einsum("nij,nj->ni", maps, steps[set_of_unit]).ravel()
+    return result

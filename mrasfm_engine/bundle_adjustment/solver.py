@@ -385,9 +385,9 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         step = problem.step(state, system, damping)
         decrement = 0.0 if step is None else -float(step @ system.gradient)
         left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
+        # A step that damping holds back is short wherever the minimum is, and its length tells nothing of others.
+        is_held_back = damping > MAX_DAMPING_OF_DECREMENT
         if step is not None:
-            # How long a step is that damping holds back tells nothing of others.
-            is_held_back = damping > MAX_DAMPING_OF_DECREMENT
             update = step if is_held_back or is_flat else problem.accelerated(state, acceleration, step, system)
             trial, trial_costs, trial_cost = problem.after(state, costs, system, update)
             if update is not step and not trial_cost < cost:
@@ -405,13 +405,10 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
-        as_it_is = decrement if update is step and damping <= MAX_DAMPING_OF_DECREMENT else 0.0
+        as_it_is = decrement if update is step and not is_held_back else 0.0
         is_flat = cost - trial_cost <= options.function_tolerance * cost
         # An accelerated update may end as high on the other side of the minimum: the next step is applied as it is.
-        if (is_flat and update is step) or (
-            # A step that damping holds back is short wherever the minimum is.
-            free and damping <= MAX_DAMPING_OF_DECREMENT and left <= options.decrement_tolerance
-        ):
+        if (is_flat and update is step) or (free and not is_held_back and left <= options.decrement_tolerance):
             termination = Termination.CONVERGED
         state, cost, costs = trial, trial_cost, trial_costs
         damping, raise_by = max(damping / 5.0, 1e-10), 2.0

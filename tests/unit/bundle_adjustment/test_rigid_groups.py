@@ -25,12 +25,17 @@ def with_sets(case: Case, **changes: object) -> Problem:
     return replace(case.problem, sets=RigidGroups(of_unit=OF_UNIT, count=2), **changes)
 
 
-def moved(problem: Problem, state: State, step: np.ndarray) -> State:
-    """The state after a step (12,) of both sets."""
+def by_unit(problem: Problem, state: State, step: np.ndarray) -> np.ndarray:
+    """Steps (6 units,) that go with a step (12,) of both sets."""
     assert problem.sets is not None
     of, maps = problem.sets.unit_from_set_steps(state, problem.layout)
-    by_unit = np.einsum("nij,nj->ni", maps, step.reshape(2, 6)[of])
-    return problem.retract(state, by_unit.ravel(), state.points_m)
+    result: np.ndarray = np.einsum("nij,nj->ni", maps, step.reshape(2, 6)[of]).ravel()
+    return result
+
+
+def moved(problem: Problem, state: State, step: np.ndarray) -> State:
+    """The state after a step (12,) of both sets."""
+    return problem.retract(state, by_unit(problem, state, step), state.points_m)
 
 
 def whole_map(of: np.ndarray, maps: np.ndarray) -> np.ndarray:
@@ -109,15 +114,11 @@ def test_a_sum_of_steps_is_made_a_step_of_rigid_sets(case: Case) -> None:
     problem, rng = with_sets(case), np.random.default_rng(0)
     assert problem.sets is not None
 
-    def by_unit(state: State, step: np.ndarray) -> np.ndarray:
-        of, maps = problem.sets.unit_from_set_steps(state, problem.layout)
-        return np.einsum("nij,nj->ni", maps, step.reshape(2, 6)[of]).ravel()
-
     first, second = rng.normal(size=(2, 12)) * 0.01
-    own = by_unit(case.truth, first)
+    own = by_unit(problem, case.truth, first)
     np.testing.assert_allclose(problem.sets.mean_step(case.truth, problem.layout, own), own, atol=1e-12)
     later = moved(problem, case.truth, first)
-    together = own + by_unit(later, second)
+    together = own + by_unit(problem, later, second)
     rigid = problem.sets.mean_step(later, problem.layout, together)
     assert 0.0 < np.abs(rigid - together).max() < 0.05 * np.abs(together).max()
     after = problem.retract(later, rigid, later.points_m)
