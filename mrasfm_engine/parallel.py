@@ -44,8 +44,7 @@ def in_ranges(threads: int, count: int, work: Callable[[int, int], None]) -> Non
 
 def even_bounds(count: int, parts: int) -> Ints:
     """Bounds (parts + 1,) of even parts of `count` items."""
-    bounds: Ints = np.linspace(0, count, parts + 1).astype(np.int64)
-    return bounds
+    return np.arange(parts + 1, dtype=np.int64) * count // parts
 
 
 def in_parts(bounds: Ints, work: Callable[[int, int, int], None]) -> None:

@@ -467,18 +467,17 @@ class UprightPrior:
     sigma_pitch_rad: float
     up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit vector of the world frame
 
-    def _position_rows(self, state: State) -> tuple[Floats, Floats]:
-        # The rig's y axis (left) tells roll, its x axis (forward) pitch.
-        axes = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]], 1, 2)  # (n, 2, 3)
+    def _axes(self, state: State) -> Floats:
+        """Axes (n, 2, 3) over their sigmas: the rig's y axis (left) tells roll, its x axis (forward) pitch."""
         scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
-        jacobian = np.cross(axes, self.up) / scale[:, None]
-        return axes @ self.up / scale, jacobian
+        axes: Floats = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]] / scale, 1, 2)
+        return axes
 
     def cost(self, state: State) -> float:
         """See `Term`."""
-        return float(0.5 * (self._position_rows(state)[0] ** 2).sum())
+        return float(0.5 * ((self._axes(state) @ self.up) ** 2).sum())
 
     def add_to(self, state: State, layout: Layout, extra: Extra) -> None:
         """See `Term`."""
-        r, j = self._position_rows(state)
-        add_to_units(layout, extra, self.unit, j, r)
+        axes = self._axes(state)
+        add_to_units(layout, extra, self.unit, np.cross(axes, self.up), axes @ self.up)

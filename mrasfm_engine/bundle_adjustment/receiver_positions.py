@@ -147,6 +147,15 @@ class ReceiverPositions:
         return before, after, share
 
     @cached_property
+    def _shares(self) -> Floats:
+        """A (n, k): shares of knots in every sample."""
+        before, after, share = self._places
+        rows, result = np.arange(len(before)), np.zeros((len(before), len(self.knots_s)))
+        result[rows, before] = 1.0 - share
+        result[rows, after] += share
+        return result
+
+    @cached_property
     def _precision(self) -> Floats:
         """The process' precision (2, k): its superdiagonal, whose first entry is unused, and its diagonal."""
         alike = np.exp(-np.diff(self.knots_s) / self.wander_time_s)
@@ -187,11 +196,7 @@ class ReceiverPositions:
 
     def _at_knots(self, values: Floats, axis: int) -> Floats:
         """D' v (k, m) of values (n, m) of one axis."""
-        before, after, share = self._places
-        weighted = values * self._gain[:, axis, None]
-        result = np.zeros((len(self.knots_s), values.shape[1]))
-        np.add.at(result, before, weighted * (1.0 - share)[:, None])
-        np.add.at(result, after, weighted * share[:, None])
+        result: Floats = self._shares.T @ (values * self._gain[:, axis, None])
         return result
 
     def _at_samples(self, states: Floats, common: Floats) -> Floats:
@@ -261,6 +266,11 @@ class ReceiverPositions:
         """
         return self._information_and_common(columns)[0]
 
+    @cached_property
+    def _at_full_weight(self) -> tuple[Floats, ...]:
+        """M (2, k) of every axis with all samples at full weight."""
+        return tuple(self._by_knots(np.ones(len(self.unit)), axis) for axis in range(AXES))
+
     def _information_and_common(self, columns: Floats) -> tuple[Floats, Floats]:
         """The same, and I + K' C^-1 K (c, c) of the ways K in which common errors move positions, C without these."""
         count = columns.shape[2]
@@ -274,10 +284,11 @@ class ReceiverPositions:
     def _information_by_process(self, columns: Floats) -> Floats:
         """The same where positions have no error in common."""
         scaled = columns / self.sigma_m[:, :, None]
-        result: Floats = np.einsum("nam,nal->ml", scaled, scaled)
-        for axis in range(AXES):
+        flat = scaled.reshape(-1, scaled.shape[2])
+        result: Floats = flat.T @ flat
+        for axis, square in enumerate(self._at_full_weight):
             at_knots = self._at_knots(scaled[:, axis], axis)
-            result = result - at_knots.T @ _solved(self._by_knots(np.ones(len(scaled)), axis), at_knots)
+            result = result - at_knots.T @ _solved(square, at_knots)
         return result
 
     def restricted_log_likelihood(self, off_m: Floats, others: Floats) -> float:
@@ -291,8 +302,7 @@ class ReceiverPositions:
         left = float(known[-1, -1] - right @ np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
         determinant = 2.0 * float(np.log(self.sigma_m).sum()) + np.linalg.slogdet(matrix)[1]
         prior = _log_determinant(self._precision)
-        for axis in range(AXES):
-            determinant += _log_determinant(self._by_knots(np.ones(len(off_m)), axis)) - prior
+        determinant += sum(_log_determinant(square) - prior for square in self._at_full_weight)
         determinant += np.linalg.slogdet(of_common)[1]
         return -0.5 * (left + float(determinant))
 

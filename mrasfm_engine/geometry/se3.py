@@ -14,6 +14,20 @@ from numpy.typing import ArrayLike
 from mrasfm_engine.types import Floats, Ints
 
 
+def _rows_from_rotation() -> Floats:
+    """Matrix (9, 16): four times the products (4, 4) of a quaternion's components, less the identity, of a rotation."""
+    result = np.zeros((3, 3, 4, 4))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        result[i, i] = np.diag([*(2.0 * np.eye(3)[i] - 1.0), 1.0])
+        result[[i, j], [j, i], i, j] = result[[i, j], [j, i], j, i] = 1.0
+        result[k, j, i, 3] = result[k, j, 3, i] = 1.0
+        result[j, k, i, 3] = result[j, k, 3, i] = -1.0
+    return result.reshape(9, 16)
+
+
+_ROWS_FROM_ROTATION, _ROWS_OF_NOTHING = _rows_from_rotation(), np.eye(4).ravel()
+
+
 def skew(v: ArrayLike) -> Floats:
     """Cross-product matrices (..., 3, 3) of vectors (..., 3): `skew(v) @ x == cross(v, x)`."""
     v = np.asarray(v, dtype=np.float64)
@@ -40,32 +54,21 @@ def exp_so3(rotation_vector: ArrayLike) -> Floats:
 def log_so3(rotation: ArrayLike) -> Floats:
     """Rotation vectors (..., 3) in radians, norm at most pi, of rotation matrices (..., 3, 3)."""
     q = quaternion_from_rotation(rotation)
-    q = np.where(q[..., 3:] < 0, -q, q)
     v, w = q[..., :3], q[..., 3]
-    n = np.linalg.norm(v, axis=-1)
-    angle = 2 * np.arctan2(n, w)
-    factor = np.where(n < 1e-9, 2.0, angle / np.where(n < 1e-9, 1.0, n))
-    result: Floats = v * factor[..., None]
+    n = np.sqrt((v * v).sum(-1))
+    small = n < 1e-9
+    result: Floats = v * np.where(small, 2.0, 2.0 * np.arctan2(n, w) / np.where(small, 1.0, n))[..., None]
     return result
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
     """Unit quaternions (..., 4), x y z w, w >= 0 up to rounding, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=np.float64)
-    d = np.diagonal(r, axis1=-2, axis2=-1)
-    trace = d.sum(-1)
     # Shepperd's method: each row is the quaternion times four times one of its components, of which the largest serves.
-    rows = np.empty((*r.shape[:-2], 4, 4))
-    rows[..., :3, :3] = r + np.swapaxes(r, -1, -2)
-    squares = np.einsum("...ii->...i", rows)  # a view
-    squares[..., :3] = 2 * d + (1 - trace)[..., None]
-    squares[..., 3] = 1 + trace
-    for i, j, k in ((0, 2, 1), (1, 0, 2), (2, 1, 0)):
-        rows[..., i, 3] = rows[..., 3, i] = r[..., j, k] - r[..., k, j]
-    largest = squares.argmax(-1)
-    q = np.take_along_axis(rows, largest[..., None, None], -2)[..., 0, :]
-    q = q / np.sqrt((q * q).sum(-1, keepdims=True))
-    result: Floats = np.where(q[..., 3:] < 0, -q, q)
+    rows = (r.reshape(-1, 9) @ _ROWS_FROM_ROTATION + _ROWS_OF_NOTHING).reshape(-1, 4, 4)
+    q = rows[np.arange(len(rows)), np.einsum("nii->ni", rows).argmax(1)]
+    q *= (np.where(q[:, 3] < 0, -1.0, 1.0) / np.sqrt(np.einsum("ni,ni->n", q, q)))[:, None]
+    result: Floats = q.reshape(*r.shape[:-2], 4)
     return result
 
 

@@ -24,33 +24,35 @@ def select_keyframes(mapper: Mapper) -> Bools:
     images are not simultaneous, the first and the last unit of a stop stay keyframes: they tell that the car stood. A
     drive without motion has keyframes only.
     """
-    units = len(mapper.registered)
+    units, cameras = len(mapper.registered), len(mapper.camera_kind)
     keyframe = np.ones(units, dtype=np.bool_)
-    last = -1
-    for unit in range(units):
-        if last >= 0:
-            moved_px = _displacement_px(mapper, last, unit)
+    # Of every track in every camera, its keypoint in the last keyframe; -1 for none.
+    before = np.full(len(mapper.tracks) * cameras, -1, dtype=np.int64)
+    of_last = np.zeros(0, dtype=np.int64)
+    for unit, rows in enumerate(mapper.rows_of_unit):
+        place = mapper.tracks.of_keypoint[rows] * cameras + mapper.keypoints.camera[rows]
+        if len(of_last):
+            moved_px = _displacement_px(mapper, before[place], rows)
             keyframe[unit] = not moved_px < mapper.config.mapping.keyframe_motion_px
-        if keyframe[unit] and len(mapper.rows_of_unit[unit]):
-            last = unit
+        if keyframe[unit] and len(rows):
+            before[of_last], before[place] = -1, rows
+            of_last = place
     if mapper.motion.needed:
         stands = ~keyframe
         keyframe |= stands & ~(np.append(False, stands[:-1]) & np.append(stands[1:], False))
     return keyframe if keyframe.sum() > 1 else np.ones(units, dtype=np.bool_)
 
 
-def _displacement_px(mapper: Mapper, before: int, now: int) -> float:
-    """Way (px) of a camera's tracks that both units see: its median, in the camera where that is largest.
+def _displacement_px(mapper: Mapper, before: Ints, now: Ints) -> float:
+    """Way (px) of a camera's keypoints from `before` (n,), -1 for none, to `now` (n,): its median, in the camera where
+    that is largest.
 
     NaN where no camera has enough of them.
     """
-    rows = [mapper.rows_of_unit[unit] for unit in (before, now)]
-    cameras = len(mapper.camera_kind)
-    keys = [mapper.tracks.of_keypoint[r] * cameras + mapper.keypoints.camera[r] for r in rows]
-    _, a, b = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
-    way_px = np.linalg.norm(mapper.keypoints.xy_px[rows[1][b]] - mapper.keypoints.xy_px[rows[0][a]], axis=1)
-    camera = mapper.keypoints.camera[rows[0][a]]
-    enough = np.flatnonzero(np.bincount(camera, minlength=cameras) >= MIN_COMMON)
+    before, now = before[before >= 0], now[before >= 0]
+    way_px = np.linalg.norm(mapper.keypoints.xy_px[now] - mapper.keypoints.xy_px[before], axis=1)
+    camera = mapper.keypoints.camera[now]
+    enough = np.flatnonzero(np.bincount(camera) >= MIN_COMMON)
     return max((float(np.median(way_px[camera == c])) for c in enough), default=float("nan"))
 
 

@@ -217,6 +217,8 @@ class Mapper:
 
     def forget(self, units: Ints) -> None:
         """Take the poses of units back, and what their images observe."""
+        if not len(units):
+            return
         self.registered[units] = False
         images = np.flatnonzero(np.isin(self.image_unit, units))
         self.missing[images] = False
@@ -285,8 +287,9 @@ class Mapper:
         fits = errors < self.triangulator.max_error_px
         self.is_inlier[rows[has_point]] = fits
         # Also points that the new view contradicts: with it, another hypothesis may win.
-        again = np.unique(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
-        self.triangulate(again[~self.rejected[again]])
+        again = np.zeros(len(self.tracks), dtype=np.bool_)
+        again[tracks[~has_point]] = again[tracks[has_point][~fits]] = True
+        self.triangulate(np.flatnonzero(again & ~self.rejected))
 
     def complete(self, *, anew: bool = False) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point.

@@ -47,16 +47,49 @@ class MotionGroups:
     reason: Ints
 
 
+class Neighbours:
+    """The tracks nearest to tracks in the image of their reference keypoints, each looked for once.
+
+    Parameters
+    ----------
+    motion
+        Of all tracks; those asked for have been weighed.
+    focal_px
+        Of every camera (c,).
+    """
+
+    def __init__(
+        self, motion: TrackMotion, keypoints: Keypoints, tracks: Tracks, focal_px: Floats, *, threads: int = 1
+    ) -> None:
+        self._motion, self._keypoints, self._tracks = motion, keypoints, tracks
+        self._focal_px, self._threads = focal_px, threads
+        self._place = np.full(len(tracks), -1, dtype=np.int64)  # of a track among the rows
+        self._rows = np.zeros((0, NEIGHBOURS), dtype=np.int64)
+
+    def of(self, which: Ints) -> Ints:
+        """Neighbours (n, NEIGHBOURS) of tracks (n,), each at most once among them; -1 for none."""
+        new = which[self._place[which] < 0]
+        self._place[new] = len(self._rows) + np.arange(len(new))
+        self._rows = np.concatenate([self._rows, self._found(new)])
+        return self._rows[self._place[which]]
+
+    def _found(self, which: Ints) -> Ints:
+        result = np.full((len(which), NEIGHBOURS), -1, dtype=np.int64)
+        k = self._keypoints
+        reference = self._motion.reference[which]
+        reach_px = REACH_M * self._focal_px[k.camera[reference]] / self._motion.distance_m[which]
+        in_ranges(
+            self._threads,
+            len(which),
+            lambda lo, hi: _nearest(
+                reference[lo:hi], reach_px[lo:hi], k.first, k.image, k.xy_px, self._tracks.of_keypoint, result[lo:hi]
+            ),
+        )
+        return result
+
+
 def group(
-    motion: TrackMotion,
-    suspects: Ints,
-    known: Floats,
-    keypoints: Keypoints,
-    tracks: Tracks,
-    *,
-    focal_px: Floats,
-    weigh: Callable[[Ints], None],
-    threads: int = 1,
+    motion: TrackMotion, suspects: Ints, known: Floats, neighbours: Neighbours, *, weigh: Callable[[Ints], None]
 ) -> MotionGroups:
     """Decide which tracks move.
 
@@ -69,18 +102,21 @@ def group(
     known
         Log odds (tracks,) to move by something else than a track's own observations, that is by what is around its
         place; NaN where there are none.
-    focal_px
-        Of every camera (c,).
+    neighbours
+        Of the same tracks.
     weigh
         Completes `motion` for tracks.
     """
     weigh(suspects[np.isnan(motion.log_evidence[suspects])])
-    beside = _neighbours(suspects, motion, keypoints, tracks, focal_px, threads)
-    others = np.setdiff1d(beside[beside >= 0], suspects)
+    beside = neighbours.of(suspects)
+    is_other = np.zeros(len(known), dtype=np.bool_)
+    is_other[beside[beside >= 0]] = True
+    is_other[suspects] = False
+    others = np.flatnonzero(is_other)
     weigh(others[np.isnan(motion.log_evidence[others])])
     nodes = np.concatenate([suspects, others])
-    edges = np.concatenate([beside, _neighbours(others, motion, keypoints, tracks, focal_px, threads)])
-    place = np.full(len(tracks), -1, dtype=np.int64)
+    edges = np.concatenate([beside, neighbours.of(others)])
+    place = np.full(len(known), -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
     # A neighbour that is no node stands: it is beside no suspect.
     linked = np.where(edges >= 0, place[edges], -2)
@@ -100,24 +136,6 @@ def group(
     return MotionGroups(tracks=nodes[order], reason=reason[order])
 
 
-def _neighbours(
-    which: Ints, motion: TrackMotion, keypoints: Keypoints, tracks: Tracks, focal_px: Floats, threads: int
-) -> Ints:
-    """The tracks (n, NEIGHBOURS) nearest to tracks in the image of their reference keypoints; -1 for none."""
-    result = np.full((len(which), NEIGHBOURS), -1, dtype=np.int64)
-    reference = motion.reference[which]
-    reach_px = REACH_M * focal_px[keypoints.camera[reference]] / motion.distance_m[which]
-    in_ranges(
-        threads,
-        len(which),
-        lambda lo, hi: _nearest(
-            reference[lo:hi], reach_px[lo:hi], keypoints.first, keypoints.image, keypoints.xy_px, tracks.of_keypoint,
-            result[lo:hi],
-        ),
-    )  # fmt: skip
-    return result
-
-
 @njit(cache=True, nogil=True)
 def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_keypoint: Any, out: Any) -> None:
     distance = np.empty(out.shape[1])
@@ -127,10 +145,8 @@ def _nearest(reference: Any, reach: Any, first: Any, image: Any, xy: Any, of_key
             continue
         limit = reach[n] * reach[n]
         for other in range(first[image[k]], first[image[k] + 1]):
-            if of_keypoint[other] < 0 or other == k:
-                continue
             d2 = (xy[other, 0] - xy[k, 0]) ** 2 + (xy[other, 1] - xy[k, 1]) ** 2
-            if d2 >= limit:
+            if d2 >= limit or of_keypoint[other] < 0 or other == k:
                 continue
             at = count
             while at > 0 and distance[at - 1] > d2:

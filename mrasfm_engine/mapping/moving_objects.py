@@ -8,7 +8,7 @@ import numpy as np
 
 from mrasfm_engine.mapping.ground_path import ground_path
 from mrasfm_engine.mapping.mapper import Mapper
-from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, MotionGroups, group
+from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MIXTURE, SHARED, MotionGroups, Neighbours, group
 from mrasfm_engine.mapping.single_unit_tracks import log_odds_in_single_units
 from mrasfm_engine.scene.semantics import UNKNOWN
 from mrasfm_engine.triangulation.point_hypotheses import Views
@@ -61,13 +61,11 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
 
     weigh(np.flatnonzero(may_move), only_unsure=True)
     focal_px = mapper.state.camera_params[:, :2].mean(1)
+    neighbours = Neighbours(motion, mapper.keypoints, mapper.tracks, focal_px, threads=mapper.config.threads)
     suspects = np.flatnonzero(motion.log_evidence + motion.log_prior > 0.0)
 
     def moving(suspects: Ints, known: Floats) -> MotionGroups:
-        return group(
-            motion, suspects, known, mapper.keypoints, mapper.tracks,
-            focal_px=focal_px, weigh=weigh, threads=mapper.config.threads,
-        )  # fmt: skip
+        return group(motion, suspects, known, neighbours, weigh=weigh)
 
     found = moving(suspects, np.full(len(mapper.tracks), np.nan))
     known = log_odds_in_single_units(mapper, _among(found.tracks, may_move), path)
@@ -128,9 +126,13 @@ def _sigmas_px(mapper: Mapper) -> Floats:
     # numbers of its observations.
     squared = errors[telling] ** 2 / (-2 * np.log(1 - QUANTILE) * (1.0 - 1.5 / size[telling]))
     camera = mapper.keypoints.camera[rows[telling]]
-    result = np.full(len(mapper.camera_kind), np.sqrt(np.quantile(squared, QUANTILE)) if len(squared) else 1.0)
-    for c in np.unique(camera):
-        result[c] = np.sqrt(np.quantile(squared[camera == c], QUANTILE))
+    result = np.full(len(mapper.camera_kind), np.nan)
+    for c in range(len(result)):
+        of_camera = squared[camera == c]
+        if len(of_camera):
+            result[c] = np.sqrt(np.quantile(of_camera, QUANTILE))
+    if np.isnan(result).any():
+        result[np.isnan(result)] = np.sqrt(np.quantile(squared, QUANTILE)) if len(squared) else 1.0
     clipped: Floats = np.clip(result, *SIGMA_PX_RANGE)
     return clipped
 

@@ -102,7 +102,7 @@ def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
     place, result = np.searchsorted(registered, unit), np.zeros(len(unit), dtype=np.bool_)
     for step in (-1, 1):
         there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)) & ~result)
-        rig_from_world = se3.inverse(state.world_from_rig[registered[place[there] + step]])
+        rig_from_world = se3.inverse(state.world_from_rig[registered])[place[there] + step]
         in_rig_m = se3.apply(rig_from_world, points_m[there, None])[:, 0]
         for camera, rig_from_cam in enumerate(state.rig_from_cam):
             pixels = project_points(
@@ -126,9 +126,12 @@ def _neighbourhoods(mapper: Mapper, moves: Bools, path: GroundPath) -> tuple[_Sh
     units = np.arange(len(mapper.registered) + 1)
     begins, first = np.searchsorted(unit, units), np.searchsorted(unit[asked], units)
     neighbours, going_on = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
+    axis, order = _sorted_in_units(points_m, begins, first)
     in_parts(
         np.searchsorted(first, even_bounds(len(asked), mapper.config.threads)),
-        lambda lo, hi, part: _count_in_units(points_m, goes_on, begins, asked, first, lo, hi, neighbours, going_on),
+        lambda lo, hi, part: _count_in_units(
+            points_m, goes_on, axis, order, begins, asked, first, lo, hi, neighbours, going_on
+        ),
     )
     return _Shares(track=track[asked], neighbours=neighbours, going_on=going_on), single
 
@@ -154,10 +157,23 @@ def _points_of_units(is_inlier: Any, of_keypoint: Any, unit_of_keypoint: Any, co
     return units[:count].copy(), tracks[:count].copy(), images[:count].copy()
 
 
+def _sorted_in_units(points_m: Floats, begins: Ints, first: Ints) -> tuple[Ints, Ints]:
+    """The axis (units,) along which the points of every unit lie farthest apart, and their order (m,) along it within
+    their unit, of units of which any are asked for.
+    """
+    axis, order = np.zeros(len(begins) - 1, dtype=np.int64), np.zeros(len(points_m), dtype=np.int64)
+    for u in np.flatnonzero(np.diff(first)):
+        own = points_m[begins[u] : begins[u + 1]]
+        axis[u] = np.argmax(own.max(axis=0) - own.min(axis=0))
+        order[begins[u] : begins[u + 1]] = np.argsort(own[:, axis[u]])
+    return axis, order
+
+
 @njit(cache=True, nogil=True)
 def _count_in_units(
-    points: Any, goes_on: Any, begins: Any, asked: Any, first: Any, lo: int, hi: int, neighbours: Any, going_on: Any
-) -> None:
+    points: Any, goes_on: Any, axes: Any, orders: Any, begins: Any, asked: Any, first: Any, lo: int, hi: int,
+    neighbours: Any, going_on: Any,
+) -> None:  # fmt: skip
     """Count neighbours and those of them that go on, around the points `asked` (n,) of units lo..hi.
 
     Points (m, 3) from begins[u], and those asked from first[u], are of unit u.
@@ -166,12 +182,7 @@ def _count_in_units(
         begin, end = begins[u], begins[u + 1]
         if first[u] == first[u + 1]:
             continue
-        own, axis, longest = points[begin:end], 0, -1.0
-        for i in range(3):
-            extent = own[:, i].max() - own[:, i].min()
-            if extent > longest:
-                axis, longest = i, extent
-        order = np.argsort(own[:, axis])
+        own, axis, order = points[begin:end], axes[u], orders[begin:end]
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
         rows = slice(first[u], first[u + 1])

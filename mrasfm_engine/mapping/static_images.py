@@ -19,7 +19,7 @@ from mrasfm_engine.triangulation.tracks import Keypoints
 from mrasfm_engine.types import Bools, Floats, Ints
 
 STILL_PX = 2.0
-MOVING_PX = 20.0  # median of the matches that move, in a camera that shows motion; less is too little to tell by
+MOVING_PX = 20.0  # that most of the matches that move exceed in a camera that shows motion; less does not tell
 MIN_MATCHES = 30  # of a camera, before it says anything
 MOVING_SHARE = 0.2  # of them, in a camera that shows motion
 MIN_FALL = 0.14  # how steeply (sine) a ray must point down to meet the ground near by: 8 degrees
@@ -60,7 +60,7 @@ def find_still_keypoints(
                 continue
             if moves.mean() < MOVING_SHARE:
                 standing += 1
-            elif moves.sum() >= MIN_MATCHES and float(np.median(flow_px[moves])) > MOVING_PX:
+            elif moves.sum() >= MIN_MATCHES and (flow_px > MOVING_PX).sum() > 0.5 * moves.sum():
                 moving += 1
             ground = keypoints.rays[a] @ rig_from_cam[image_camera[pair.image_a], 2, :3] < -MIN_FALL
             if ground.sum() >= MIN_GROUND and moves[ground].mean() < STILL_SHARE:

@@ -155,13 +155,14 @@ def cost_of_standing(count: int, x: float, y: float, z: float, sight: Any, views
 
 @uncounted()
 def fit(
-    count: int, unknowns: int, is_near: bool, p: Any, mean: Any, weight: Any, least: float, most: float, sight: Any,
-    views: Any, scratch: Any,
+    count: int, unknowns: int, is_near: bool, p: Any, mean: Any, weight: Any, least: float, most: float, enough: float,
+    sight: Any, views: Any, scratch: Any,
 ) -> tuple[float, float, bool]:  # fmt: skip
     """Fit p to observations and priors (means and weights by unknown, from the third on), `rho` within its bounds.
 
     Returns the cost with priors, that without, and whether the information at p is positive: its factor is in scratch.
-    A start that is not near begins with a loss that forgives little, which leads near it from anywhere.
+    A start that is not near begins with a loss that forgives little, which leads near it from anywhere. Below the cost
+    that is `enough` the fit goes no further, and neither its cost nor its factor is that of the best p.
     """
     a, b, factor, step, best = (
         scratch.information, scratch.gradient, scratch.factor, scratch.step, scratch.best
@@ -177,6 +178,8 @@ def fit(
             total += weight[i] * (p[i] - mean[i]) ** 2
             a[i, i] += weight[i]
             b[i] += weight[i] * (p[i] - mean[i])
+        if total < enough:  # a loss that forgives less costs more
+            return total, data, False
         if iteration >= 0 and total < lowest:
             is_done = lowest - total < SMALL_GAIN or iteration == ITERATIONS
             lowest, lowest_data = total, data

@@ -129,10 +129,13 @@ def weigh_tracks(
 
 
 @uncounted()
-def free_distance_m(c: Any, d: Any, station: int, path: Any) -> float:
-    """Distance along a ray from c at which it is below the ground; infinite where it never is for certain."""
+def free_distance_m(c: Any, d: Any, station: int, path: Any, farthest_m: float) -> float:
+    """Distance along a ray from c at which it is below the ground; infinite where it never is for certain, or only
+    beyond the farthest distance that is asked for."""
     s, k, last = FIRST_STEP_M, station, len(path.ground_m) - 1
     for _ in range(STEPS):
+        if s >= farthest_m:
+            break
         x0, x1, x2 = c[0] + s * d[0], c[1] + s * d[1], c[2] + s * d[2]
         for _ in range(3):  # to the nearest station, along the path from that of the step before
             y0, y1, y2 = x0 - path.ground_m[k, 0], x1 - path.ground_m[k, 1], x2 - path.ground_m[k, 2]
@@ -308,10 +311,10 @@ def _weigh_each(
         station = path.station[sight.band[ref]]
         up = path.up[station]
         fall = -(up[0] * d[0] + up[1] * d[1] + up[2] * d[2])
-        least = 1.0 / free_distance_m(c, d, station, path) if fall > 0.0 else 0.0
+        mean[2], weight[2] = 0.0, 1.0 / SIGMA_INVERSE_M**2
+        too_little = UNSURE + UNSURE_PER_NUMBER * (2 * n - STANDS)
         p[:] = 0.0
-        p[2] = max(1.0 / FAR_M, least)
-        is_near, x0, x1, x2 = False, 0.0, 0.0, 0.0
+        is_near = False
         if triangulated[t]:
             x0, x1, x2 = points[t, 0] - c[0], points[t, 1] - c[1], points[t, 2] - c[2]
             depth = d[0] * x0 + d[1] * x1 + d[2] * x2
@@ -320,22 +323,30 @@ def _weigh_each(
                 p[0] = (e[0, 0] * x0 + e[0, 1] * x1 + e[0, 2] * x2) / depth
                 p[1] = (e[1, 0] * x0 + e[1, 1] * x1 + e[1, 2] * x2) / depth
                 p[2] = 1.0 / depth
-        mean[2], weight[2] = 0.0, 1.0 / SIGMA_INVERSE_M**2
-        too_little = UNSURE + UNSURE_PER_NUMBER * (2 * n - STANDS)
-        if only_unsure and is_near and p[2] >= least:
-            # Its point explains it so well that the best one need not be found.
-            at_point = cost_of_standing(n, x0, x1, x2, sight, views, scratch)
-            if at_point + weight[2] * p[2] ** 2 < too_little:
-                continue
-        stands, data, is_sound = fit(n, STANDS, is_near, p, mean, weight, least, nearest, sight, views, scratch)
+                if only_unsure:
+                    # Where its point explains it so well, the best one need not be found.
+                    at_point = cost_of_standing(n, x0, x1, x2, sight, views, scratch)
+                    if at_point + weight[2] * p[2] ** 2 < too_little and (
+                        not fall > 0.0 or free_distance_m(c, d, station, path, depth) == np.inf
+                    ):
+                        continue
+        least = 1.0 / free_distance_m(c, d, station, path, np.inf) if fall > 0.0 else 0.0
+        if not is_near:
+            p[2] = max(1.0 / FAR_M, least)
+        enough = too_little if only_unsure else 0.0
+        stands, data, is_sound = fit(n, STANDS, is_near, p, mean, weight, least, nearest, enough, sight, views, scratch)
+        if stands < enough:
+            continue
         reference[t], observations[t], misfit[t] = sight.keypoint[ref], n, data / n
         distance[t] = 1.0 / max(p[2], 1.0 / FARTHEST_M)
-        if not is_sound or (only_unsure and stands < too_little):
+        if not is_sound:
             continue
         # Errors of poses and of the calibration look like a small velocity: what stands may have one as well.
         p[3] = p[4] = mean[3] = mean[4] = 0.0
         weight[3] = weight[4] = 1.0 / (max(p[2], 1.0 / FARTHEST_M) * DRIFT_M_S) ** 2
-        stands, _, is_sound = fit(n, MOVES, np.bool_(True), p, mean, weight, least, nearest, sight, views, scratch)
+        stands, _, is_sound = fit(
+            n, MOVES, np.bool_(True), p, mean, weight, least, nearest, 0.0, sight, views, scratch
+        )  # fmt: skip
         if not is_sound:
             continue
         log_priors = math.log(weight[2]) + math.log(weight[3]) + math.log(weight[4])
@@ -356,7 +367,7 @@ def _weigh_each(
             if not from_standing:
                 p[2] = expected
             total, _, is_sound = fit(
-                n, MOVES, from_standing, p, mean, weight, lowest, nearest, sight, views, scratch
+                n, MOVES, from_standing, p, mean, weight, lowest, nearest, 0.0, sight, views, scratch
             )  # fmt: skip
             if is_sound and total < moves:
                 moves = total

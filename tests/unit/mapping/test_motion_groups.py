@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MotionGroups, group
+from mrasfm_engine.mapping.motion_groups import ALONE, BESIDE, MotionGroups, Neighbours, group
 from mrasfm_engine.triangulation.track_motion import SPEED_M_S, TrackMotion
 from mrasfm_engine.triangulation.tracks import Keypoints, Tracks
 
@@ -43,7 +43,8 @@ def grouped(
     known = np.full(count, np.nan) if known is None else known
     suspects = np.flatnonzero((log_evidence > 0.0) | (known > 0.0))
     tracks = Tracks.from_labels(np.arange(count))
-    return group(motion, suspects, known, keypoints, tracks, focal_px=np.array([500.0]), weigh=lambda _: None)
+    neighbours = Neighbours(motion, keypoints, tracks, np.array([500.0]))
+    return group(motion, suspects, known, neighbours, weigh=lambda _: None)
 
 
 def around(value: float, middle: float) -> np.ndarray:

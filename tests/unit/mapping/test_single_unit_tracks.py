@@ -130,7 +130,8 @@ def test_neighbours_are_the_nearest_within_reach(points: int) -> None:
     asked = np.flatnonzero(rng.random(points) < 0.7)
     neighbours, going_on = np.zeros(len(asked), dtype=np.int64), np.zeros(len(asked), dtype=np.int64)
     begins, first = np.array([0, points]), np.array([0, len(asked)])
-    single_unit_tracks._count_in_units(points_m, goes_on, begins, asked, first, 0, 1, neighbours, going_on)
+    axis, order = single_unit_tracks._sorted_in_units(points_m, begins, first)
+    single_unit_tracks._count_in_units(points_m, goes_on, axis, order, begins, asked, first, 0, 1, neighbours, going_on)
     tree = cKDTree(points_m)
     for row, own in enumerate(asked):
         inside = [m for m in tree.query_ball_point(points_m[own], single_unit_tracks.REACH_M) if m != own]
