@@ -242,11 +242,11 @@ class ReceiverPositions:
             return
         count, (before, after, share) = len(self.knots_s), self._places
         with_units = np.zeros((layout.num_units, count, UNIT_DOF, AXES))
-        for knot, part in ((before, 1.0 - share), (after, share)):
-            np.add.at(with_units, (slots, knot[free]), -j_w * (self._gain * part[:, None])[free, None, :])
+        for knot, part in ((before, 1.0 - share), (after, share)):  # each unit has one measurement
+            with_units[slots, knot[free]] -= j_w * (self._gain * part[:, None])[free, None, :]
         with_process = np.moveaxis(with_units, 1, 3).reshape(-1, AXES * count)
         with_common = np.zeros((layout.num_units, UNIT_DOF, more))
-        np.add.at(with_common, slots, -(j_w @ self._common[free]))
+        with_common[slots] = -(j_w @ self._common[free])
         square, last = np.eye(AXES * count + more), slice(AXES * count, AXES * count + more)
         for axis in range(AXES):
             own = slice(axis * count, (axis + 1) * count)

@@ -107,7 +107,7 @@ def choose_observations(mapper: Mapper, result: Refinement, *, is_last: bool) ->
     result.observations_dropped += observations
     result.points_dropped += points
     if is_last:
-        result.moving = drop_moving(mapper)
+        result.moving = drop_moving(mapper, for_map=True)
         result.points_dropped += mapper.drop_contradicted()
     else:
         mapper.drop(result.moving.tracks)

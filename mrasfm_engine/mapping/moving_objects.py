@@ -40,10 +40,16 @@ class MovingTracks:
     judged: int = 0  # tracks that could have been taken out
 
 
-def drop_moving(mapper: Mapper) -> MovingTracks:
+def drop_moving(mapper: Mapper, *, for_map: bool) -> MovingTracks:
     """Take out the points of tracks that move, and reject them; `Mapper.complete` and `readmit` let them in again.
 
     Where masks name what moves, only keypoints without a class are judged: all others show the static world.
+
+    Parameters
+    ----------
+    for_map
+        Also those that one unit alone observes. Seen at one instant, a thing that moves contradicts no pose. Where
+        images of a unit are not simultaneous, these are always taken out.
     """
     may_move = np.ones(len(mapper.tracks), dtype=np.bool_)
     if _masks_name_what_moves(mapper):
@@ -68,9 +74,11 @@ def drop_moving(mapper: Mapper) -> MovingTracks:
         return group(motion, suspects, known, neighbours, weigh=weigh)
 
     found = moving(suspects, np.full(len(mapper.tracks), np.nan))
-    known = log_odds_in_single_units(mapper, _among(found.tracks, may_move), path)
-    known[~may_move] = np.nan
-    in_one_unit = known > 0.0
+    in_one_unit = np.zeros(len(mapper.tracks), dtype=np.bool_)
+    if for_map or not mapper.state.simultaneous:
+        known = log_odds_in_single_units(mapper, _among(found.tracks, may_move), path)
+        known[~may_move] = np.nan
+        in_one_unit = known > 0.0
     if in_one_unit.any():
         # What one unit alone observes speaks for its neighbours, too: those on the same thing that hardly tell.
         found = moving(np.union1d(suspects, np.flatnonzero(in_one_unit)), known)

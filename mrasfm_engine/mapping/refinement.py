@@ -86,7 +86,7 @@ def refine(
     result = Refinement(absolute=AbsolutePriors() if absolute is None else absolute)
     _place(mapper, result, calibrated, cancel)
     free_units = free_units_of(mapper, result.absolute)
-    result.moving = drop_moving(mapper)
+    result.moving = drop_moving(mapper, for_map=False)
     result.sigma_px = observation_sigma_px(mapper)
     _decide_what_varies(mapper, result, free_units, is_calibrated=calibrated is not None, cancel=cancel)
     adjust_in_rounds(mapper, result, free_units, progress=progress, cancel=cancel)

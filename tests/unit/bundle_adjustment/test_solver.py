@@ -173,7 +173,9 @@ def test_what_is_left_after_a_step_is_the_rest_of_its_series(rate: float) -> Non
     faster = [*decrements[:2], 0.01 * decrements[2]]
     np.testing.assert_allclose(solver._decrement_left(faster), 0.01 * steps[3:].sum() ** 2)
     # Steps that hardly shrink end by their own length, and so does a first one.
-    assert solver._decrement_left([1.0, 0.9]) == solver._decrement_left([0.0, 0.9]) == solver._decrement_left([0.9]) == 0.9
+    assert (
+        solver._decrement_left([1.0, 0.9]) == solver._decrement_left([0.0, 0.9]) == solver._decrement_left([0.9]) == 0.9
+    )
 
 
 @pytest.mark.parametrize("seed", range(4))

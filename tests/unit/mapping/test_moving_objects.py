@@ -58,7 +58,7 @@ def test_the_points_of_a_car_that_moves_go_and_those_of_the_street_stay(car: Car
     simulated = with_cars(drive(straight=straight), [car])
     mapper = mapped(simulated)
     before = mapper.triangulated.copy()
-    found = drop_moving(mapper)
+    found = drop_moving(mapper, for_map=True)
     on_car = shown_points(mapper, simulated) >= len(simulated.truth.points_m)
     assert on_car.sum() > 20
     left = (on_car & mapper.triangulated).sum() / on_car.sum()
@@ -96,7 +96,7 @@ def test_a_street_without_traffic_stays_whole(kwargs: dict[str, float]) -> None:
     simulated = with_cars(drive(**kwargs), [PARKED])
     mapper = mapped(simulated)
     before = mapper.triangulated.sum()
-    drop_moving(mapper)
+    drop_moving(mapper, for_map=True)
     assert mapper.triangulated.sum() >= 0.98 * before
 
 
@@ -104,7 +104,7 @@ def test_nothing_is_dropped_where_it_is_switched_off() -> None:
     config = EngineConfig(threads=1, mapping=MappingConfig(drop_moving=False))
     mapper = mapped(with_cars(drive(), [ACROSS]), config)
     before = mapper.triangulated.copy()
-    found = drop_moving(mapper)
+    found = drop_moving(mapper, for_map=True)
     assert found.judged == len(found.tracks) == 0
     np.testing.assert_array_equal(mapper.triangulated, before)
 
@@ -115,9 +115,9 @@ def test_what_a_mask_calls_static_is_not_judged() -> None:
     manifest = mapper.drive.manifest.model_copy(update={"label_map": label_map})
     mapper.drive = Drive(mapper.drive.root, manifest)
     mapper.track_class[:] = CLASS_CODES[SemanticClass.STATIC]
-    assert drop_moving(mapper).judged == 0
+    assert drop_moving(mapper, for_map=True).judged == 0
     mapper.track_class[::2] = 0
-    assert drop_moving(mapper).judged == len(mapper.track_class[::2])
+    assert drop_moving(mapper, for_map=True).judged == len(mapper.track_class[::2])
 
 
 def test_a_refined_scene_has_no_points_of_a_car_ahead() -> None:
@@ -142,7 +142,7 @@ def test_time_grows_with_the_observations() -> None:
 
     def cpu_seconds(mapper: Mapper) -> float:
         begun = time.process_time()
-        drop_moving(mapper)
+        drop_moving(mapper, for_map=True)
         spent = time.process_time() - begun
         mapper.readmit()
         return spent

@@ -67,11 +67,19 @@ def test_points_of_a_car_that_two_cameras_see_at_one_instant_go() -> None:
     low = shows_car & (mapper.state.points_m[:, 2] < 0.3)
     assert (before & shows_car).sum() > 100
     assert (before & low).sum() > 20
-    found = drop_moving(mapper)
+    found = drop_moving(mapper, for_map=True)
     assert (mapper.triangulated & shows_car).sum() <= 0.1 * (before & shows_car).sum()
     assert (mapper.triangulated & low).sum() <= 0.5 * (before & low).sum()
     assert (before & ~mapper.triangulated & ~shows_car).sum() <= 0.02 * (before & ~shows_car).sum()
     assert {IN_ONE_UNIT, BESIDE} <= set(found.reason.tolist())
+
+
+def test_for_poses_what_one_unit_sees_at_one_instant_stays_and_else_goes() -> None:
+    simulated = street(ONCOMING)
+    mapper = mapped(simulated, lambda shown: shown >= len(simulated.truth.points_m))
+    assert IN_ONE_UNIT not in drop_moving(mapper, for_map=False).reason
+    mapper.place_bands()  # as where cameras are triggered apart
+    assert IN_ONE_UNIT in drop_moving(mapper, for_map=False).reason
 
 
 @pytest.mark.parametrize("moving", [0, 60, 600])
