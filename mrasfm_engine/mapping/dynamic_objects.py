@@ -21,6 +21,7 @@ from mrasfm_engine.jit import njit, uncounted
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.parallel import mapped
 from mrasfm_engine.scene.scene import PairMatches
+from mrasfm_engine.triangulation.tracks import matching_keypoints
 from mrasfm_engine.types import Bools, Floats, Ints
 
 NEAREST_M = 1.0  # nearer things than this are not expected
@@ -34,6 +35,7 @@ STILL_PX = 2.0  # in a covered image, what moves by less says nothing of the wor
 MIN_KEYPOINTS = 30  # that move along, before an image is called covered
 TELLING_SHARE = 0.5  # of the keypoints with a measure, in a covered image
 COVERED_SHARE = 0.75  # of all matched ones
+BATCH = 64  # pairs that a thread looks at together
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,30 +109,36 @@ def without_keypoints(pairs: Sequence[PairMatches], first: Ints, removed: Bools)
 
 def _flows(mapper: Mapper, pairs: Sequence[PairMatches]) -> Iterator[tuple[Ints, Ints, Floats, Floats]]:
     """Expected and measured motion, in pixels, of the keypoints of every pair of one camera's images."""
-    posed = mapper.image_posed
+    posed, keypoints = mapper.image_posed, mapper.keypoints
     world_from_cam = mapper.state.world_from_rig[mapper.image_unit] @ mapper.motion.unit_from_image(mapper.state)
     world_from_cam = world_from_cam @ mapper.state.rig_from_cam[mapper.image_camera]
-
-    def tells(pair: PairMatches) -> bool:
+    of_camera: dict[int, list[PairMatches]] = {}
+    for pair in pairs:
         a, b = pair.image_a, pair.image_b
         along = mapper.image_unit[a] != mapper.image_unit[b] and mapper.image_camera[a] == mapper.image_camera[b]
-        return bool(along and posed[a] and posed[b])
+        if along and posed[a] and posed[b]:
+            of_camera.setdefault(int(mapper.image_camera[a]), []).append(pair)
 
-    def flow(pair: PairMatches) -> tuple[Ints, Ints, Floats, Floats]:
-        keypoints, camera = mapper.keypoints, int(mapper.image_camera[pair.image_a])
-        a, b = mapper.matched_keypoints(pair, int(mapper.image_unit[pair.image_a]))
-        xy_px = keypoints.xy_px.take(a, axis=0)
-        least_px = _least_flow_px(
+    def flow(some: tuple[int, list[PairMatches]]) -> tuple[Ints, Ints, Floats, Floats]:
+        camera, together = some
+        edges, counts = matching_keypoints(keypoints.first, together)
+        a, b = np.ascontiguousarray(edges.T)
+        image_a, image_b = np.array([(pair.image_a, pair.image_b) for pair in together]).T
+        xy_px, least_px = keypoints.xy_px.take(a, axis=0), np.empty(len(a))
+        _least_flows_px(
+            int(mapper.camera_kind[camera]),
+            mapper.state.camera_params[camera],
+            np.ascontiguousarray(mapper.state.rig_from_cam[camera, 2, :3]),
             keypoints.rays.take(a, axis=0),
             xy_px,
-            se3.inverse(world_from_cam[pair.image_b]) @ world_from_cam[pair.image_a],
-            up=mapper.state.rig_from_cam[camera, 2, :3],
-            kind=int(mapper.camera_kind[camera]),
-            params=mapper.state.camera_params[camera],
+            np.repeat(np.arange(len(counts)), counts),
+            se3.inverse(world_from_cam[image_b]) @ world_from_cam[image_a],
+            least_px,
         )
         return a, b, least_px, np.hypot(*(keypoints.xy_px.take(b, axis=0) - xy_px).T)
 
-    yield from mapped(mapper.config.threads, flow, [pair for pair in pairs if tells(pair)])
+    batches = [(camera, own[at : at + BATCH]) for camera, own in of_camera.items() for at in range(0, len(own), BATCH)]
+    yield from mapped(mapper.config.threads, flow, batches)
 
 
 @njit(cache=True, nogil=True)
@@ -147,44 +155,38 @@ def _vote(a: Any, b: Any, least_px: Any, moved_px: Any, along: Any, seen: Any, m
                 moves[k] = True
 
 
-def _least_flow_px(rays: Floats, xy_px: Floats, b_from_a: Floats, *, up: Floats, kind: int, params: Floats) -> Floats:
-    """Least motion of points (n,) of a static world from image a to image b, at whatever depth they are.
-
-    One of at most `MIN_FLOW_PX` is not followed down to the least. `up` (3,) is the rig's up direction in camera axes:
-    it bounds the depth of rays that point down. Infinite where a point of the world could not be in front of camera b.
-    """
-    falling = -(rays @ up) - MAX_GRADE
-    deepest = np.where(
-        falling * FARTHEST_M > MAX_CAMERA_HEIGHT_M, MAX_CAMERA_HEIGHT_M / np.maximum(falling, 1e-9), FARTHEST_M
-    )
-    turned = rays @ b_from_a[:3, :3].T
-    result = np.empty(len(rays))
-    _distances_to_paths(kind, params, turned, b_from_a[:3, 3], np.maximum(deepest, NEAREST_M), xy_px, result)
-    return result
-
-
 @njit(cache=True, nogil=True)
-def _distances_to_paths(kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any) -> None:
-    """Distances (n,) of pixels from where rays (n, 3) from an origin are seen, from their deepest point to the nearest.
+def _least_flows_px(
+    kind: int, params: Any, up: Any, rays: Any, xy_px: Any, of_pair: Any, b_from_a: Any, out: Any
+) -> None:
+    """Least motions (n,) of points of a static world between the images of their pairs, at whatever depth they are.
 
-    The way is followed in straight steps between DEPTHS knots, until it is as near as `MIN_FLOW_PX`; those knots that
-    the camera does not show are left out.
+    Rays (n, 3) and pixels (n, 2) are of image a, `b_from_a` (pairs, 4, 4) of one camera at both instants. `up` (3,) is
+    the rig's up direction in camera axes: it bounds the depth of rays that point down. The way from the deepest point
+    to the nearest is followed in straight steps between DEPTHS knots, until it is as near as `MIN_FLOW_PX`; knots that
+    the camera does not show are left out. Infinite where a point of the world could not be in front of camera b.
     """
-    _follow_paths(kind, params, rays, origin, deepest, xy_px, out, np.empty(6), np.empty(8))
+    _follow_paths(kind, params, up, rays, xy_px, of_pair, b_from_a, out, np.empty(6), np.empty(8))
 
 
 @uncounted()
 def _follow_paths(
-    kind: int, params: Any, rays: Any, origin: Any, deepest: Any, xy_px: Any, out: Any, work: Any, proj: Any
+    kind: int, params: Any, up: Any, rays: Any, xy_px: Any, of_pair: Any, b_from_a: Any, out: Any, work: Any, proj: Any
 ) -> None:
     for i in range(len(rays)):
+        m, d0, d1, d2 = b_from_a[of_pair[i]], rays[i, 0], rays[i, 1], rays[i, 2]
+        falling, deepest = -(d0 * up[0] + d1 * up[1] + d2 * up[2]) - MAX_GRADE, FARTHEST_M
+        if falling * FARTHEST_M > MAX_CAMERA_HEIGHT_M:
+            deepest = max(MAX_CAMERA_HEIGHT_M / falling, NEAREST_M)
+        t0 = m[0, 0] * d0 + m[0, 1] * d1 + m[0, 2] * d2
+        t1 = m[1, 0] * d0 + m[1, 1] * d1 + m[1, 2] * d2
+        t2 = m[2, 0] * d0 + m[2, 1] * d1 + m[2, 2] * d2
         best, before = np.inf, False
         u0, v0 = 0.0, 0.0
         for s in range(DEPTHS):
             part = s / (DEPTHS - 1)
-            inverse = (1.0 - part) / deepest[i] + part / NEAREST_M
-            z = rays[i, 2] / inverse + origin[2]
-            x, y = rays[i, 0] / inverse + origin[0], rays[i, 1] / inverse + origin[1]
+            inverse = (1.0 - part) / deepest + part / NEAREST_M
+            x, y, z = t0 / inverse + m[0, 3], t1 / inverse + m[1, 3], t2 / inverse + m[2, 3]
             if not project(kind, params, x, y, z, work, proj):
                 before = False
                 continue

@@ -10,12 +10,11 @@ decides with poses, and names images.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import groupby
 
 import numpy as np
 
 from mrasfm_engine.scene.scene import PairMatches
-from mrasfm_engine.triangulation.tracks import Keypoints
+from mrasfm_engine.triangulation.tracks import Keypoints, matching_keypoints
 from mrasfm_engine.types import Bools, Floats, Ints
 
 STILL_PX = 2.0
@@ -25,6 +24,7 @@ MOVING_SHARE = 0.2  # of them, in a camera that shows motion
 MIN_FALL = 0.14  # how steeply (sine) a ray must point down to meet the ground near by: 8 degrees
 MIN_GROUND = 10  # matches on such rays
 STILL_SHARE = 0.5  # of these
+BATCH = 256  # pairs that are looked at together
 
 
 def find_still_keypoints(
@@ -43,29 +43,44 @@ def find_still_keypoints(
     """
     result = np.zeros(len(keypoints.image), dtype=np.bool_)
     same = [p for p in pairs if image_camera[p.image_a] == image_camera[p.image_b]]
+    if not same:
+        return result
+    shown = np.concatenate(
+        [
+            _shown(keypoints, image_camera, rig_from_cam, same[begin : begin + BATCH])
+            for begin in range(0, len(same), BATCH)
+        ]
+    )
+    count, moves, far, ground, ground_moves = shown.T
+    tells = count >= MIN_MATCHES
+    stands = tells & (moves < MOVING_SHARE * count)
+    shows_motion = tells & ~stands & (moves >= MIN_MATCHES) & (far > 0.5 * moves)
+    is_quiet = tells & (ground >= MIN_GROUND) & (ground_moves < STILL_SHARE * ground)
+    # A standing car that others drive past looks alike: then the cameras that show no motion are more.
+    units = np.sort(image_unit[[(pair.image_a, pair.image_b) for pair in same]], axis=1)
+    of_units = np.unique(units, axis=0, return_inverse=True)[1].ravel()
+    moving, standing = np.bincount(of_units, shows_motion), np.bincount(of_units, stands)
+    for n in np.flatnonzero(is_quiet & (moving >= np.maximum(standing, 1))[of_units]).tolist():
+        edges, _ = matching_keypoints(keypoints.first, [same[n]])
+        result[edges[_flow_px(keypoints, edges) <= STILL_PX]] = True
+    return result
 
-    def units(pair: PairMatches) -> tuple[int, int]:
-        a, b = sorted((int(image_unit[pair.image_a]), int(image_unit[pair.image_b])))
-        return a, b
 
-    for _, group in groupby(sorted(same, key=units), key=units):
-        quiet: list[Ints] = []
-        moving = standing = 0
-        for pair in group:
-            a = keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
-            b = keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
-            flow_px = np.hypot(*(keypoints.xy_px.take(b, axis=0) - keypoints.xy_px.take(a, axis=0)).T)
-            moves = flow_px > STILL_PX
-            if len(flow_px) < MIN_MATCHES:
-                continue
-            if moves.mean() < MOVING_SHARE:
-                standing += 1
-            elif moves.sum() >= MIN_MATCHES and (flow_px > MOVING_PX).sum() > 0.5 * moves.sum():
-                moving += 1
-            ground = keypoints.rays[a] @ rig_from_cam[image_camera[pair.image_a], 2, :3] < -MIN_FALL
-            if ground.sum() >= MIN_GROUND and moves[ground].mean() < STILL_SHARE:
-                quiet += [a[~moves], b[~moves]]
-        # A standing car that others drive past looks alike: then the cameras that show no motion are more.
-        if quiet and moving >= max(standing, 1):
-            result[np.concatenate(quiet)] = True
+def _shown(keypoints: Keypoints, image_camera: Ints, rig_from_cam: Floats, pairs: Sequence[PairMatches]) -> Ints:
+    """Numbers (pairs, 5) of matches: all, those that move, those that move far, on the ground, and those there that
+    move.
+    """
+    edges, counts = matching_keypoints(keypoints.first, pairs)
+    of_pair, flow_px = np.repeat(np.arange(len(pairs)), counts), _flow_px(keypoints, edges)
+    up = rig_from_cam[image_camera[[pair.image_a for pair in pairs]], 2, :3]
+    ground = np.einsum("ni,ni->n", keypoints.rays.take(edges[:, 0], axis=0), up.take(of_pair, axis=0)) < -MIN_FALL
+    moves = flow_px > STILL_PX
+    kinds = (moves, flow_px > MOVING_PX, ground, ground & moves)
+    return np.stack([counts, *(np.bincount(of_pair[kind], minlength=len(pairs)) for kind in kinds)], axis=1)
+
+
+def _flow_px(keypoints: Keypoints, edges: Ints) -> Floats:
+    """Lengths (n,) of the ways in the image from the first to the second of matching keypoints (n, 2)."""
+    a, b = edges.T
+    result: Floats = np.hypot(*(keypoints.xy_px.take(b, axis=0) - keypoints.xy_px.take(a, axis=0)).T)
     return result

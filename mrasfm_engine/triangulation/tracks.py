@@ -117,6 +117,21 @@ def _rays_of(xy_px: Floats, camera: Ints, kinds: Ints, params: Floats) -> Floats
     return rays
 
 
+def matching_keypoints(first: Ints, pairs: Sequence[PairMatches]) -> tuple[Ints, Ints]:
+    """Keypoints (n, 2) of the inliers of some pairs, one pair after the other, and how many (pairs,) each has.
+
+    `first` (images + 1,) is as in `Keypoints`.
+    """
+    if not pairs:
+        return np.zeros((0, 2), dtype=np.int64), np.zeros(0, dtype=np.int64)
+    inliers = np.concatenate([pair.inliers for pair in pairs])
+    begins = np.cumsum([0, *(len(pair.inliers) for pair in pairs)])
+    counts = np.diff(np.concatenate([[0], np.cumsum(inliers)])[begins])
+    images = np.array([(pair.image_a, pair.image_b) for pair in pairs])
+    matches = np.concatenate([pair.matches for pair in pairs])[inliers]
+    return np.repeat(first[images], counts, axis=0) + matches, counts
+
+
 def _inliers_of(pair: PairMatches) -> PairMatches:
     """The pair without the matches that are no inliers."""
     matches = pair.matches[pair.inliers]
@@ -240,22 +255,11 @@ def build_tracks(keypoints: Keypoints, pairs: Sequence[PairMatches]) -> Tracks:
     left out, which keeps single wrong matches from growing tracks together.
     """
     n = len(keypoints.image)
-    order = sorted(range(len(pairs)), key=lambda i: -int(pairs[i].inliers.sum()))
-    edges = [
-        np.stack(
-            [
-                keypoints.first[pairs[i].image_a] + pairs[i].matches[pairs[i].inliers, 0],
-                keypoints.first[pairs[i].image_b] + pairs[i].matches[pairs[i].inliers, 1],
-            ],
-            axis=1,
-        )
-        for i in order
-    ]
+    edges, _ = matching_keypoints(keypoints.first, sorted(pairs, key=lambda pair: -np.count_nonzero(pair.inliers)))
     parent = np.arange(n, dtype=np.int64)
     following, last = np.full(n, -1, dtype=np.int64), np.arange(n, dtype=np.int64)
     stamp = np.full(int(keypoints.image.max(initial=-1)) + 1, -1, dtype=np.int64)
-    all_edges = np.concatenate(edges).astype(np.int64) if edges else np.zeros((0, 2), dtype=np.int64)
-    _join(all_edges, keypoints.image, parent, following, last, stamp)
+    _join(edges, keypoints.image, parent, following, last, stamp)
     while True:
         up = parent[parent]
         if (up == parent).all():
