@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import groupby
 from operator import itemgetter
 
@@ -82,10 +83,10 @@ class _TwoViews:
     direction: Floats
     side: NDArray[np.int8]
 
-    @property
+    @cached_property
     def votes(self) -> tuple[int, int]:
         """Number of matches that meet in front for a motion along the direction, and against it."""
-        return int((self.side > 0).sum()), int((self.side < 0).sum())
+        return int(np.count_nonzero(self.side > 0)), int(np.count_nonzero(self.side < 0))
 
     @property
     def majority(self) -> int:
