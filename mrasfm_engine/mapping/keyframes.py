@@ -27,7 +27,7 @@ def select_keyframes(mapper: Mapper) -> Bools:
     units, cameras = len(mapper.registered), len(mapper.camera_kind)
     keyframe = np.ones(units, dtype=np.bool_)
     # Of every track in every camera, its keypoint in the last keyframe; -1 for none.
-    before = np.full(len(mapper.tracks) * cameras, -1, dtype=np.int64)
+    before = np.full(len(mapper.tracks) * cameras, -1, dtype=np.int32)
     of_last = np.zeros(0, dtype=np.int64)
     for unit, rows in enumerate(mapper.rows_of_unit):
         place = mapper.tracks.of_keypoint[rows] * cameras + mapper.keypoints.camera[rows]
