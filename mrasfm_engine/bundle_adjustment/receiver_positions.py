@@ -147,7 +147,7 @@ class ReceiverPositions:
         return before, after, share
 
     @cached_property
-    def _shares(self) -> Floats:
+    def shares(self) -> Floats:
         """A (n, k): shares of knots in every sample."""
         before, after, share = self._places
         rows, result = np.arange(len(before)), np.zeros((len(before), len(self.knots_s)))
@@ -156,7 +156,7 @@ class ReceiverPositions:
         return result
 
     @cached_property
-    def _precision(self) -> Floats:
+    def precision(self) -> Floats:
         """The process' precision (2, k): its superdiagonal, whose first entry is unused, and its diagonal."""
         alike = np.exp(-np.diff(self.knots_s) / self.wander_time_s)
         lost = np.maximum(1.0 - alike**2, 1e-12)
@@ -185,18 +185,18 @@ class ReceiverPositions:
         return result
 
     def _by_knots(self, weights: Floats, axis: int) -> Floats:
-        """M (2, k) of one axis, as `_precision` has it."""
+        """M (2, k) of one axis, as `precision` has it."""
         before, after, share = self._places
         weighted, count = weights * self._gain[:, axis] ** 2, len(self.knots_s)
         diagonal = np.bincount(before, weighted * (1.0 - share) ** 2, minlength=count)
         diagonal += np.bincount(after, weighted * share**2, minlength=count)
         off = np.bincount(after, weighted * share * (1.0 - share), minlength=count)
-        result: Floats = self._precision + np.stack([off, diagonal])
+        result: Floats = self.precision + np.stack([off, diagonal])
         return result
 
     def _at_knots(self, values: Floats, axis: int) -> Floats:
         """D' v (k, m) of values (n, m) of one axis."""
-        result: Floats = self._shares.T @ (values * self._gain[:, axis, None])
+        result: Floats = self.shares.T @ (values * self._gain[:, axis, None])
         return result
 
     def _at_samples(self, states: Floats, common: Floats) -> Floats:
@@ -214,7 +214,7 @@ class ReceiverPositions:
         states, common = np.empty((len(self.knots_s), AXES)), np.zeros(self._common.shape[2])
         residuals, weights = np.empty_like(whitened), np.ones(len(whitened))
         _find_best_states(
-            whitened, self._gain, self._common, *self._places, self._precision, self.loss_scale,
+            whitened, self._gain, self._common, *self._places, self.precision, self.loss_scale,
             states, common, residuals, weights,
         )  # fmt: skip
         return states, common, residuals, weights
@@ -228,7 +228,7 @@ class ReceiverPositions:
     def cost(self, state: State) -> float:
         """See `Term`."""
         states, common, residuals, _ = self._best(self._whitened(state)[1])
-        off, diagonal = self._precision
+        off, diagonal = self.precision
         prior = (diagonal[:, None] * states**2).sum() + 2.0 * (off[1:, None] * states[1:] * states[:-1]).sum()
         return cauchy_cost(residuals, self.loss_scale) + 0.5 * float(prior + (common**2).sum())
 
@@ -264,47 +264,24 @@ class ReceiverPositions:
 
         C is the covariance of the positions' errors, with all of them at full weight.
         """
-        return self._information_and_common(columns)[0]
-
-    @cached_property
-    def _at_full_weight(self) -> tuple[Floats, ...]:
-        """M (2, k) of every axis with all samples at full weight."""
-        return tuple(self._by_knots(np.ones(len(self.unit)), axis) for axis in range(AXES))
-
-    def _information_and_common(self, columns: Floats) -> tuple[Floats, Floats]:
-        """The same, and I + K' C^-1 K (c, c) of the ways K in which common errors move positions, C without these."""
         count = columns.shape[2]
         known = self._information_by_process(np.concatenate([columns, self.common_m], axis=2))
+        # Positions' common errors may explain some of it.
         of_common = np.eye(known.shape[0] - count) + known[count:, count:]
         result: Floats = known[:count, :count] - known[:count, count:] @ np.linalg.solve(
             of_common, known[count:, :count]
         )
-        return result, of_common
+        return result
 
     def _information_by_process(self, columns: Floats) -> Floats:
         """The same where positions have no error in common."""
         scaled = columns / self.sigma_m[:, :, None]
         flat = scaled.reshape(-1, scaled.shape[2])
         result: Floats = flat.T @ flat
-        for axis, square in enumerate(self._at_full_weight):
+        for axis in range(AXES):
             at_knots = self._at_knots(scaled[:, axis], axis)
-            result = result - at_knots.T @ _solved(square, at_knots)
+            result = result - at_knots.T @ _solved(self._by_knots(np.ones(len(scaled)), axis), at_knots)
         return result
-
-    def restricted_log_likelihood(self, off_m: Floats, others: Floats) -> float:
-        """Log likelihood of errors (n, 3) of the positions, up to a constant, whatever moves the antenna.
-
-        That is of what the ways (n, 3, m), by which the scene may be moved, cannot explain [Patterson and Thompson,
-        Recovery of inter-block information when block sizes are unequal, Biometrika 1971].
-        """
-        known, of_common = self._information_and_common(np.concatenate([others, off_m[:, :, None]], axis=2))
-        matrix, right = known[:-1, :-1], known[:-1, -1]
-        left = float(known[-1, -1] - right @ np.linalg.lstsq(matrix, right, rcond=1e-12)[0])
-        determinant = 2.0 * float(np.log(self.sigma_m).sum()) + np.linalg.slogdet(matrix)[1]
-        prior = _log_determinant(self._precision)
-        determinant += sum(_log_determinant(square) - prior for square in self._at_full_weight)
-        determinant += np.linalg.slogdet(of_common)[1]
-        return -0.5 * (left + float(determinant))
 
     def information_given(self, way: Floats, others: Floats) -> float:
         """Information on one way (n, 3) in which the antenna may be moved, if others (n, 3, m) are not known."""
@@ -399,12 +376,6 @@ def _find_best_states(
             weights[i] = renewed
         if change < SAME_WEIGHTS:
             break
-
-
-def _log_determinant(tridiagonal: Floats) -> float:
-    """Logarithm of the determinant of a positive definite matrix, given as to `_solved`."""
-    bands = tridiagonal if tridiagonal.shape[1] > 1 else tridiagonal[1:]
-    return 2.0 * float(np.log(scipy.linalg.cholesky_banded(bands, check_finite=False)[-1]).sum())
 
 
 def _solved(tridiagonal: Floats, right: Floats) -> Floats:

@@ -66,7 +66,7 @@ class Neighbours:
         self._place = np.full(len(tracks), -1, dtype=np.int64)  # of a track among the rows
         self._rows = np.zeros((0, NEIGHBOURS), dtype=np.int64)
 
-    def of(self, which: Ints) -> Ints:
+    def beside(self, which: Ints) -> Ints:
         """Neighbours (n, NEIGHBOURS) of tracks (n,), each at most once among them; -1 for none."""
         new = which[self._place[which] < 0]
         self._place[new] = len(self._rows) + np.arange(len(new))
@@ -108,14 +108,14 @@ def group(
         Completes `motion` for tracks.
     """
     weigh(suspects[np.isnan(motion.log_evidence[suspects])])
-    beside = neighbours.of(suspects)
+    beside = neighbours.beside(suspects)
     is_other = np.zeros(len(known), dtype=np.bool_)
     is_other[beside[beside >= 0]] = True
     is_other[suspects] = False
     others = np.flatnonzero(is_other)
     weigh(others[np.isnan(motion.log_evidence[others])])
     nodes = np.concatenate([suspects, others])
-    edges = np.concatenate([beside, neighbours.of(others)])
+    edges = np.concatenate([beside, neighbours.beside(others)])
     place = np.full(len(known), -1, dtype=np.int64)
     place[nodes] = np.arange(len(nodes))
     # A neighbour that is no node stands: it is beside no suspect.

@@ -10,6 +10,7 @@ import scipy.linalg
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.optimize import minimize
 
+from mrasfm_engine.bundle_adjustment.receiver_likelihood import restricted_log_likelihood
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions, time_of_process_s
 from mrasfm_engine.geometry.gnss_track import GnssTrack
 from mrasfm_engine.geometry.neighbours import nearest
@@ -270,11 +271,12 @@ def most_likely_errors(mapper: Mapper, placement: Placement, *, clock_varies: bo
     )
     least, most = np.log([MIN_WHITE, MIN_WHITE]), np.log([np.inf, placement.noise_factor])
 
+    log_likelihood = restricted_log_likelihood(declared_errors, off_m, moves)
+
     def unlikelihood(log_sizes: Floats) -> float:
         white, wander = np.exp(np.clip(log_sizes, least, most))
-        sizes = {"sigma_m": white * sigma_m, "wander_m": wander * sigma_m}
         declared = float(np.log(np.hypot(white, wander)) / USUAL_LOG_SIGMA) ** 2
-        return 0.5 * declared - replace(declared_errors, **sizes).restricted_log_likelihood(off_m, moves)
+        return 0.5 * declared - log_likelihood(white, wander)
 
     start = np.log([max(begin.white, MIN_WHITE), max(begin.wander, 0.3)])
     simplex = start + np.array([[0.0, 0.0], [0.7, 0.0], [0.0, -0.7]])

@@ -7,6 +7,7 @@ import pytest
 import scipy.linalg
 
 from mrasfm_engine.bundle_adjustment.problem import Layout
+from mrasfm_engine.bundle_adjustment.receiver_likelihood import restricted_log_likelihood
 from mrasfm_engine.bundle_adjustment.receiver_positions import MAX_KNOTS, ReceiverPositions, time_of_process_s
 from mrasfm_engine.bundle_adjustment.reduced_camera_system import Extra
 from mrasfm_engine.geometry import se3
@@ -181,10 +182,13 @@ def test_an_antenna_elsewhere_costs_what_the_error_costs_that_it_makes_of_all_po
 
 
 @pytest.mark.parametrize("common", COMMON)
-def test_likelihood_with_common_errors_is_that_of_their_covariance(common: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("jump", [False, True])
+def test_likelihood_with_common_errors_is_that_of_their_covariance(common: tuple[str, ...], jump: bool) -> None:
     rng = np.random.default_rng(6)
     state = moving(rng)
-    term = with_common(received(state, rng), state, common)
+    term = received(state, rng)
+    term = with_common(jumping(term, 5) if jump else term, state, common)
+    declared = replace(term, wander_m=term.sigma_m)
     off_m = state.unit_position_m + state.unit_rotation @ ARM_M - term.position_m
     moves = np.tile(np.eye(3), (UNITS, 1, 1))
 
@@ -195,9 +199,11 @@ def test_likelihood_with_common_errors_is_that_of_their_covariance(common: tuple
         flat = off_m.T.ravel()
         return -0.5 * float(flat @ left @ flat - np.linalg.slogdet(inverse)[1] + np.linalg.slogdet(known)[1])
 
-    other = replace(term, sigma_m=2.0 * term.sigma_m, wander_m=0.5 * term.wander_m)
-    found = [one.restricted_log_likelihood(off_m, moves) for one in (term, other)]
-    assert found[1] - found[0] == pytest.approx(log_likelihood(other) - log_likelihood(term), rel=1e-8)
+    found, as_declared = restricted_log_likelihood(declared, off_m, moves), log_likelihood(declared)
+    for white, wander in ((2.0, 0.5), (0.01, 3.0), (0.7, 0.0)):
+        other = replace(declared, sigma_m=white * declared.sigma_m, wander_m=wander * declared.wander_m)
+        expected = log_likelihood(other) - as_declared
+        assert found(white, wander) - found(1.0, 1.0) == pytest.approx(expected, rel=1e-7)
     known = np.linalg.inv(whole_covariance(term))
     x = np.swapaxes(moves, 0, 1).reshape(-1, 3)
     np.testing.assert_allclose(term.information(moves), x.T @ known @ x, rtol=1e-8, atol=1e-8)
