@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from threadpoolctl import ThreadpoolController
@@ -31,7 +29,6 @@ from mrasfm_engine.scene.state import State
 from mrasfm_engine.types import Bools, Cancel, Floats, Ints
 
 POINT_STEPS = 2  # steps of points whose poses have moved
-TOLD_BY = 3  # last steps, of what further ones will be
 MAX_DAMPING_OF_DECREMENT = 1e-3  # under more, the decrement of a step says little about where the minimum is
 
 
@@ -54,9 +51,9 @@ class SolverOptions:
     # of them is farther than sqrt(2 decrement) of its sigmas from the minimum. What is left is points that move
     # between their robust weights, which moves no pose.
     decrement_tolerance: float = 5e-3
-    # Whether what the last steps let expect of all further ones may be as small, instead of the last step itself. Along
-    # a flat direction it goes on for longer than these show: only where further adjustments follow or positions hold
-    # the scene, and of many units.
+    # Whether what two steps that were applied as they are let expect of all further ones may be as small, instead of
+    # the last step itself. Along a flat direction it goes on for longer than these show: only where further adjustments
+    # follow, and of many units.
     expects_rest: bool = False
     initial_damping: float = 1e-4  # less where the start is good: weak directions, as scale, are damped most
     loss_scale: float = 2.0  # of the Cauchy loss, in sigmas
@@ -357,17 +354,16 @@ def solve(problem: Problem, *, cancel: Cancel | None = None) -> tuple[State, Rep
     return state, report
 
 
-def _decrement_left(decrements: Sequence[float]) -> float:
-    """Decrement that is left after a step, from those of the last steps and of itself, the last of them.
+def _decrement_left(before: float, decrement: float) -> float:
+    """Decrement that is left after a step, from those of the step before and of itself.
 
-    The steps that follow go on shrinking as the slowest of these did: an accelerated one shrinks faster than the next
-    may. It is at most that of the step itself, as a rule by which more slowly shrinking ones end as well.
+    The steps that follow go on shrinking as these two do. It is at most that of the step itself, as a rule by which
+    more slowly shrinking ones end as well.
     """
-    last = decrements[-1]
-    if len(decrements) < 2 or not all(0.0 < after < before for before, after in pairwise(decrements)):
-        return last
-    rate = math.sqrt(max(after / before for before, after in pairwise(decrements)))
-    return last * min(rate / (1.0 - rate), 1.0) ** 2
+    if not 0.0 < decrement < before:
+        return decrement
+    rate = math.sqrt(decrement / before)
+    return decrement * min(rate / (1.0 - rate), 1.0) ** 2
 
 
 def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
@@ -380,7 +376,7 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
     if not free and not problem.observations.num_free_points:
         termination = Termination.NOTHING_FREE
     acceleration, is_flat = AndersonAcceleration(), False
-    decrements = deque[float](maxlen=TOLD_BY)  # of the last steps, as long as none is rejected or held back
+    as_it_is = 0.0  # decrement of the step before, where neither acceleration nor damping changed it
     while iterations < options.max_iterations and termination is Termination.ITERATIONS:
         if cancel is not None and cancel():
             break
@@ -388,12 +384,9 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
         system = problem.normal_equations(state, damping)
         step = problem.step(state, system, damping)
         decrement = 0.0 if step is None else -float(step @ system.gradient)
+        left = _decrement_left(as_it_is, decrement) if options.expects_rest else decrement
         # A step that damping holds back is short wherever the minimum is, and its length tells nothing of others.
         is_held_back = damping > MAX_DAMPING_OF_DECREMENT
-        if is_held_back:
-            decrements.clear()
-        decrements.append(decrement)
-        left = _decrement_left(decrements) if options.expects_rest else decrement
         if step is not None:
             update = step if is_held_back or is_flat else problem.accelerated(state, acceleration, step, system)
             trial, trial_costs, trial_cost = problem.after(state, costs, system, update)
@@ -405,14 +398,14 @@ def _minimise(problem: Problem, cancel: Cancel | None) -> tuple[State, Report]:
                 acceleration.record(step, system.gradient, update)
         if step is None or not trial_cost < cost:
             acceleration.clear()
-            decrements.clear()
-            is_flat = False
+            as_it_is, is_flat = 0.0, False
             if damping > 1e8:
                 termination = Termination.NO_PROGRESS
             elif step is not None and trial_cost - cost <= options.function_tolerance * cost * 1e-3:
                 termination = Termination.CONVERGED  # at the bottom, rounding decides about up or down
             damping, raise_by = damping * raise_by, raise_by * 2.0
             continue
+        as_it_is = decrement if update is step and not is_held_back else 0.0
         is_flat = cost - trial_cost <= options.function_tolerance * cost
         # An accelerated update may end as high on the other side of the minimum: the next step is applied as it is.
         if (is_flat and update is step) or (free and not is_held_back and left <= options.decrement_tolerance):

@@ -17,7 +17,7 @@ from mrasfm_engine.bundle_adjustment.problem import INTRINSICS
 from mrasfm_engine.bundle_adjustment.receiver_positions import ReceiverPositions
 from mrasfm_engine.bundle_adjustment.solver import Problem, Report, SolverOptions
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
-from mrasfm_engine.mapping.calibration import CalibrationDecision, calibration_prior, has_few_units, of_cameras_alone
+from mrasfm_engine.mapping.calibration import CalibrationDecision, calibration_prior, of_cameras_alone
 from mrasfm_engine.mapping.intrinsics import IntrinsicsDecision, intrinsics_prior
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.miscalibration import MiscalibratedPair, Miscalibration
@@ -118,7 +118,6 @@ def solver_options(mapper: Mapper, result: Refinement, *, rough: bool = False) -
         max_iterations=15 if rough else 40,
         function_tolerance=TOLERANCE,
         decrement_tolerance=ROUGH_DECREMENT_TOLERANCE if rough else DECREMENT_TOLERANCE,
-        expects_rest=result.georeferenced and not has_few_units(mapper),
         initial_damping=INITIAL_DAMPING,
         loss_scale=mapper.config.bundle_adjustment.loss_scale / result.sigma_factor,
         sigma_px=result.sigma_px * result.sigma_factor,

@@ -166,25 +166,15 @@ def test_an_extrapolated_step_that_costs_more_is_taken_as_it_is(monkeypatch: pyt
 @pytest.mark.parametrize("rate", [0.1, 0.45])
 def test_what_is_left_after_a_step_is_the_rest_of_its_series(rate: float) -> None:
     steps = rate ** np.arange(60)
-    decrements = (steps**2).tolist()
-    np.testing.assert_allclose(solver._decrement_left(decrements[:2]), steps[2:].sum() ** 2)
-    np.testing.assert_allclose(solver._decrement_left(decrements[1:4]), steps[4:].sum() ** 2)
-    # Where one shrank faster than those before it, the next may be as slow as these.
-    faster = [*decrements[:2], 0.01 * decrements[2]]
-    np.testing.assert_allclose(solver._decrement_left(faster), 0.01 * steps[3:].sum() ** 2)
-    # Steps that hardly shrink end by their own length, and so does a first one.
-    assert (
-        solver._decrement_left([1.0, 0.9]) == solver._decrement_left([0.0, 0.9]) == solver._decrement_left([0.9]) == 0.9
-    )
+    np.testing.assert_allclose(solver._decrement_left(1.0, rate**2), steps[2:].sum() ** 2)
+    # Steps that hardly shrink end by their own length.
+    assert solver._decrement_left(1.0, 0.9) == solver._decrement_left(0.0, 0.9) == 0.9
 
 
 @pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("accelerates", [False, True])
-def test_an_adjustment_ends_as_soon_as_little_is_left(
-    seed: int, accelerates: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not accelerates:
-        monkeypatch.setattr(AndersonAcceleration, "update_for", lambda self, step, gradient: step)
+def test_an_adjustment_ends_as_soon_as_little_is_left(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    # An extrapolated step tells nothing of the next one.
+    monkeypatch.setattr(AndersonAcceleration, "update_for", lambda self, step, gradient: step)
     case = drive(noise_px=0.5, seed=seed)
     start = perturbed(case.truth, np.random.default_rng(seed), units=range(1, 8), unit_m=0.05, unit_deg=0.2)
     options = SolverOptions(function_tolerance=0.0, decrement_tolerance=0.1, expects_rest=True, sigma_px=0.5)
@@ -195,10 +185,9 @@ def test_an_adjustment_ends_as_soon_as_little_is_left(
     further = problem.step(solution, system, 0.0)
     assert further is not None
     assert 0.0 < -float(further @ system.gradient) < options.decrement_tolerance
-    monkeypatch.setattr(solver, "_decrement_left", lambda decrements: decrements[-1])
+    monkeypatch.setattr(solver, "_decrement_left", lambda before, decrement: decrement)
     _, by_the_last_step = solve(problem)
-    # Accelerated, some end within one step of a length to tolerate after one that is far longer.
-    assert by_the_last_step.iterations - report.iterations >= (0 if accelerates else 1)
+    assert report.iterations < by_the_last_step.iterations
 
 
 @pytest.mark.parametrize("outlier_fraction", [0.0, 0.1])
