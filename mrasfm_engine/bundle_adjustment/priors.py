@@ -468,7 +468,10 @@ class UprightPrior:
     up: Floats = field(default_factory=lambda: np.array([0.0, 0.0, 1.0]))  # (3,) unit vector of the world frame
 
     def _axes(self, state: State) -> Floats:
-        """Axes (n, 2, 3) over their sigmas: the rig's y axis (left) tells roll, its x axis (forward) pitch."""
+        """Axes (n, 2, 3): the rig's y axis (left) tells roll, its x axis (forward) pitch.
+
+        They are divided by the sigmas, with which all units together count as one measurement.
+        """
         scale = np.array([self.sigma_roll_rad, self.sigma_pitch_rad]) * np.sqrt(len(self.unit))
         axes: Floats = np.swapaxes(state.unit_rotation[self.unit][:, :, [1, 0]] / scale, 1, 2)
         return axes

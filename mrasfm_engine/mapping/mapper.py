@@ -287,9 +287,9 @@ class Mapper:
         fits = errors < self.triangulator.max_error_px
         self.is_inlier[rows[has_point]] = fits
         # Also points that the new view contradicts: with it, another hypothesis may win.
-        again = np.zeros(len(self.tracks), dtype=np.bool_)
-        again[tracks[~has_point]] = again[tracks[has_point][~fits]] = True
-        self.triangulate(np.flatnonzero(again & ~self.rejected))
+        again = np.sort(np.concatenate([tracks[~has_point], tracks[has_point][~fits]]))
+        again = again[np.diff(again, prepend=-1) > 0]
+        self.triangulate(again[~self.rejected[again]])
 
     def complete(self, *, anew: bool = False) -> None:
         """Let every point have the observations that now fit it, and try again for tracks without a point.

@@ -99,11 +99,11 @@ def _off_the_ground(points_m: Floats, path: GroundPath, *, threads: int = 1) -> 
 def _seen_by_next(mapper: Mapper, points_m: Floats, unit: Ints) -> Bools:
     """Return whether the registered unit before or that after has points (n, 3) of units (n,) in view."""
     registered, state = np.flatnonzero(mapper.registered), mapper.state
+    rig_from_world = se3.inverse(state.world_from_rig[registered])
     place, result = np.searchsorted(registered, unit), np.zeros(len(unit), dtype=np.bool_)
     for step in (-1, 1):
         there = np.flatnonzero((place + step >= 0) & (place + step < len(registered)) & ~result)
-        rig_from_world = se3.inverse(state.world_from_rig[registered])[place[there] + step]
-        in_rig_m = se3.apply(rig_from_world, points_m[there, None])[:, 0]
+        in_rig_m = se3.apply(rig_from_world[place[there] + step], points_m[there, None])[:, 0]
         for camera, rig_from_cam in enumerate(state.rig_from_cam):
             pixels = project_points(
                 int(mapper.camera_kind[camera]),

@@ -68,6 +68,14 @@ def test_quaternions_are_xyzw_as_scipys() -> None:
     )
 
 
+@pytest.mark.parametrize("shape", [(), (0,), (6,), (2, 3), (2, 0), (1, 2, 3)])
+def test_rotations_have_any_number_of_batch_dimensions(shape: tuple[int, ...]) -> None:
+    vectors = 0.9 * random_axes(6)[: int(np.prod(shape))].reshape(*shape, 3)
+    rotations = se3.exp_so3(vectors)
+    assert se3.quaternion_from_rotation(rotations).shape == (*shape, 4)
+    np.testing.assert_allclose(se3.log_so3(rotations), vectors, atol=1e-14)
+
+
 def test_quaternions_are_normalised_first() -> None:
     quaternion = np.array([[0.1, -0.2, 0.3, 0.9]])
     np.testing.assert_allclose(

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,12 +24,6 @@ def grouped(
     NaN has no evidence, and gets none when it is asked for, as tracks that one unit alone observes.
     """
     count = len(log_evidence)
-    xy = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), -1).reshape(-1, 2)
-    zeros = np.zeros(count, dtype=np.int64)
-    keypoints = Keypoints(
-        first=np.array([0, count]), number=np.arange(count), image=zeros, unit=zeros, camera=zeros, band=zeros,
-        xy_px=100.0 + 20.0 * xy, rays=np.tile([0.0, 0.0, 1.0], (count, 1)),
-    )  # fmt: skip
     motion = TrackMotion(
         log_evidence=log_evidence.copy(),
         log_prior=np.zeros(count),
@@ -42,9 +38,18 @@ def grouped(
     )
     known = np.full(count, np.nan) if known is None else known
     suspects = np.flatnonzero((log_evidence > 0.0) | (known > 0.0))
-    tracks = Tracks.from_labels(np.arange(count))
-    neighbours = Neighbours(motion, keypoints, tracks, np.array([500.0]))
-    return group(motion, suspects, known, neighbours, weigh=lambda _: None)
+    return group(motion, suspects, known, neighbours_of(motion), weigh=lambda _: None)
+
+
+def neighbours_of(motion: TrackMotion) -> Neighbours:
+    """Of nine tracks, of which each has one keypoint."""
+    xy = np.stack(np.meshgrid(np.arange(3.0), np.arange(3.0)), -1).reshape(-1, 2)
+    count, zeros = len(xy), np.zeros(len(xy), dtype=np.int64)
+    keypoints = Keypoints(
+        first=np.array([0, count]), number=np.arange(count), image=zeros, unit=zeros, camera=zeros, band=zeros,
+        xy_px=100.0 + 20.0 * xy, rays=np.tile([0.0, 0.0, 1.0], (count, 1)),
+    )  # fmt: skip
+    return Neighbours(motion, keypoints, Tracks.from_labels(np.arange(count)), np.array([500.0]))
 
 
 def around(value: float, middle: float) -> np.ndarray:
@@ -59,6 +64,14 @@ def test_a_track_that_hardly_tells_moves_as_its_neighbours_are_known_to() -> Non
     assert found.tracks.tolist() == list(range(9))
     assert found.reason[IN_THE_MIDDLE] == BESIDE
     assert set(np.delete(found.reason, IN_THE_MIDDLE)) == {ALONE}
+
+
+def test_neighbours_are_the_same_whatever_was_asked_for_before() -> None:
+    motion = replace(TrackMotion.empty(9), distance_m=np.full(9, 25.0), reference=np.arange(9))
+    asked, every = neighbours_of(motion), neighbours_of(motion).of(np.arange(9))
+    assert set(every[IN_THE_MIDDLE]) - {-1} == {1, 3, 5, 7}
+    for which in ([4, 2], [], [2, 8, 4, 0], [0, 1, 2, 3, 4, 5, 6, 7, 8]):
+        np.testing.assert_array_equal(asked.of(np.array(which, dtype=np.int64)), every[which])
 
 
 def test_what_is_known_to_stand_does_not_move_with_its_neighbours() -> None:
