@@ -68,10 +68,10 @@ def test_a_track_that_hardly_tells_moves_as_its_neighbours_are_known_to() -> Non
 
 def test_neighbours_are_the_same_whatever_was_asked_for_before() -> None:
     motion = replace(TrackMotion.empty(9), distance_m=np.full(9, 25.0), reference=np.arange(9))
-    asked, every = neighbours_of(motion), neighbours_of(motion).of(np.arange(9))
+    asked, every = neighbours_of(motion), neighbours_of(motion).beside(np.arange(9))
     assert set(every[IN_THE_MIDDLE]) - {-1} == {1, 3, 5, 7}
     for which in ([4, 2], [], [2, 8, 4, 0], [0, 1, 2, 3, 4, 5, 6, 7, 8]):
-        np.testing.assert_array_equal(asked.of(np.array(which, dtype=np.int64)), every[which])
+        np.testing.assert_array_equal(asked.beside(np.array(which, dtype=np.int64)), every[which])
 
 
 def test_what_is_known_to_stand_does_not_move_with_its_neighbours() -> None:
