@@ -264,14 +264,13 @@ class StageStore:
     def _read(self, name: str, key: str, *, arrays: bool) -> tuple[Arrays, dict[str, Any]] | None:
         path = self._folder / checkpoint_file(self._prefix + name)
         try:
-            # Opened here: np.load leaves a file open that turns out not to be an archive.
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                header = json.loads(str(archive["header"]))
+            with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+                header = _header(archive)
                 if header["key"] != key:
                     return None
                 # By name: a damaged directory can hide arrays.
                 wanted = header["arrays"] if arrays else ()
-                return {name: archive[name] for name in wanted}, header["report"]
+                return {name: _array(archive, name) for name in wanted}, header["report"]
         except MemoryError:
             raise
         except Exception:
@@ -302,9 +301,23 @@ class StageStore:
 
 
 def _header(archive: zipfile.ZipFile) -> dict[str, Any]:
-    with archive.open("header.npy") as member:
-        header: dict[str, Any] = json.loads(str(np.lib.format.read_array(member, allow_pickle=False)))
-        return header
+    header: dict[str, Any] = json.loads(str(_array(archive, "header")))
+    return header
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
+    """Read a whole array, up to the last byte of its file: there its checksum is compared.
+
+    Raises
+    ------
+    Exception
+        Of a dozen kinds, where the file is damaged.
+    """
+    with archive.open(f"{name}.npy") as member:
+        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
+        if member.read(1):  # a damaged shape asks for less
+            raise ValueError(name)
+        return array
 
 
 def _member(archive: zipfile.ZipFile, file: BinaryIO, name: str) -> _Member:

@@ -156,6 +156,25 @@ def test_a_corrupt_file_is_never_taken_for_a_result(store: StageStore, tmp_path:
     assert found_nothing > 250
 
 
+@pytest.mark.parametrize(
+    ("there", "instead"),
+    [
+        (b"'shape': (5000, 4)", b"'shape': (4000, 4)"),
+        (b"'shape': (5000, 4)", b"'shape': (5000,3 )"),
+        (b"NUMPY\x01\x00\x76\x00{'descr': '<f8'", b"NUMPY\x01\x00\x74\x00{'descr': '<f8'"),  # its own length
+    ],
+)
+def test_an_array_that_seems_shorter_is_never_taken_for_a_result(tmp_path: Path, there: bytes, instead: bytes) -> None:
+    """numpy reads as much as the array's head asks for, and zipfile compares the checksum at the end alone."""
+    store = StageStore(tmp_path / ".stages")
+    store.save("features", "key", {"positions": np.ones((5000, 4))}, REPORT)
+    whole = file_of(tmp_path).read_bytes()
+    assert whole.count(there) == 1
+    file_of(tmp_path).write_bytes(whole.replace(there, instead))
+    assert store.load("features", "key") is None
+    assert store.open("features", "key") is None
+
+
 @pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04", b"\x93NUMPY", bytes(1000)])
 def test_something_else_under_that_name_is_ignored(store: StageStore, tmp_path: Path, content: bytes) -> None:
     file_of(tmp_path).write_bytes(content)
