@@ -303,7 +303,7 @@ def _document(path: Path) -> dict[str, Any]:
         document = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise FolderViewError(f"{path} does not exist: give a folder that holds it.") from None
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise FolderViewError(f"{path} cannot be read: {error}. Write it again.") from error
     if not isinstance(document, dict):
         raise FolderViewError(f"{path} is no JSON object. Write it again.")

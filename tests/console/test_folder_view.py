@@ -58,9 +58,10 @@ def test_a_scene_is_shown_with_its_images(open_console: Open, world: World, driv
 def test_a_folder_that_is_none_is_named(tmp_path: Path) -> None:
     with pytest.raises(FolderViewError, match=r"has no report\.json: give the folder of a complete scene or map"):
         create_view(tmp_path)
-    (tmp_path / "report.json").write_text("[")
-    with pytest.raises(FolderViewError, match=r"report\.json cannot be read"):
-        create_view(tmp_path)
+    for damaged in ("[", "[" * 100_000):
+        (tmp_path / "report.json").write_text(damaged)
+        with pytest.raises(FolderViewError, match=r"report\.json cannot be read"):
+            create_view(tmp_path)
     for report in ({"formats": {}}, {"summary": []}, {"summary": {}, "components": 1}):  # the first is an export's
         (tmp_path / "report.json").write_text(json.dumps(report))
         with pytest.raises(FolderViewError, match=r"report\.json is not a scene's: give the folder of"):
