@@ -58,6 +58,7 @@ from service.errors import (
     store_unavailable,
 )
 from service.settings import Settings
+from service.storage.artifacts import StoreAwayError
 from service.storage.spool import sweep
 from service.storage.uploads.resumable import sweep as sweep_resumable
 
@@ -208,8 +209,9 @@ def _answer_errors(app: FastAPI) -> None:
             return problem_response(_disk_full())
         raise error
 
+    @app.exception_handler(StoreAwayError)
     @app.exception_handler(BaseError)
-    async def store(request: Request, error: BaseError) -> Response:
+    async def store(request: Request, error: Exception) -> Response:
         log.error("the artifact store does not answer", exc_info=error)
         return problem_response(store_unavailable())
 

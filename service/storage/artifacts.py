@@ -55,6 +55,13 @@ class ObjectMissingError(FileNotFoundError):
         super().__init__(errno.ENOENT, "the artifact store has no such object", key)
 
 
+class StoreAwayError(ConnectionError):
+    """The store's folder is not there any more: it was moved, or its disk is not mounted. It may come back."""
+
+    def __init__(self) -> None:
+        super().__init__(errno.ENOENT, "the folder of the artifact store is not there")
+
+
 @dataclass(frozen=True)
 class StoredObject:
     """An object as the store lists it; `changed_us` is when it came."""
@@ -105,6 +112,7 @@ class ArtifactStore:
             return
         os.chmod(path, 0o440)
         target = self._root / key
+        self._make_parents(target)
         is_copy = _move_or_copy(path, target)
         try:
             if durable:
@@ -150,9 +158,12 @@ class ArtifactStore:
         ------
         FileNotFoundError
             Where the store has no such object.
+        StoreAwayError
+            Where the store's folder is not there.
         """
         if self._root is None:
             return
+        self._require_root()
         path = self._root / key
         _sync(path)
         _sync(path.parent)
@@ -173,6 +184,7 @@ class ArtifactStore:
                 for chunk in obstore.get(self._store, key).stream(min_chunk_size=_CHUNK_BYTES):
                     digest.update(chunk)
         except FileNotFoundError:
+            self._require_root()
             return None
         return digest.hexdigest()
 
@@ -217,7 +229,25 @@ class ArtifactStore:
         try:
             (self._root / key).stat()
         except FileNotFoundError:
+            self._require_root()
             raise ObjectMissingError(key) from None
+
+    def _require_root(self) -> None:
+        if self._root is not None and not self._root.exists():
+            raise StoreAwayError
+
+    def _make_parents(self, target: Path) -> None:
+        """Make the folders above an object, but never the store's own: in a new one, nobody would find it again."""
+        assert self._root is not None
+        if target.parent.is_dir():
+            return
+        self._require_root()
+        for folder in reversed(target.relative_to(self._root).parents[:-1]):
+            try:
+                (self._root / folder).mkdir(exist_ok=True, mode=0o700)
+            except FileNotFoundError:  # it went away meanwhile
+                self._require_root()
+                raise
 
     def read(self, key: str) -> bytes:
         """The whole object, for small ones.
@@ -292,7 +322,7 @@ class ArtifactStore:
         key = f"probe/{secrets.token_hex(8)}"
         if self._root is not None:
             path = self._root / key
-            path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._make_parents(path)
             try:
                 path.write_bytes(b"probe")
             finally:
@@ -341,7 +371,7 @@ def _link_or_copy(path: Path, target: Path) -> None:
 def _move_or_copy(path: Path, target: Path) -> bool:
     """Move a file, or copy it where `target` is on another disk; whether it is a copy."""
     try:
-        _move(path, target)
+        os.replace(path, target)
         return False
     except OSError as error:
         if error.errno != errno.EXDEV:
@@ -353,14 +383,6 @@ def _move_or_copy(path: Path, target: Path) -> bool:
     finally:
         partial.unlink(missing_ok=True)
     return True
-
-
-def _move(path: Path, target: Path) -> None:
-    try:
-        os.replace(path, target)
-    except FileNotFoundError:  # the first in its folder
-        target.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        os.replace(path, target)
 
 
 def _sync(path: Path) -> None:

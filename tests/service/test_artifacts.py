@@ -25,7 +25,7 @@ from service.storage.artifacts import ArtifactStore
 from service.storage.transfers import fetch_each
 from tests.helpers.live_api import HOST, free_port, settings_of
 from tests.helpers.s3_server import s3_server, settings_of_bucket
-from worker.retry import retry
+from worker.retry import may_pass, retry
 
 CONTENT = os.urandom(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -272,6 +272,31 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     store.folder.write_bytes(b"a file in its place")
     with pytest.raises(OSError, match="directory"):
         store.require_writable()
+
+
+def test_a_folder_that_is_moved_away_is_not_made_anew(tmp_path: Path) -> None:
+    """What would be stored in a new one is lost when the old one comes back."""
+    store = ArtifactStore(settings_of(tmp_path / "data"))
+    put(store, tmp_path / "scratch", CONTENT, KEY)
+    assert store.folder is not None
+    away = store.folder.rename(tmp_path / "away")
+    path = tmp_path / "new"
+    path.write_bytes(b"new")
+    steps: list[Callable[[], object]] = [
+        lambda: store.put_file(path, "blobs/new"),
+        lambda: store.fetch(KEY, tmp_path / "fetched"),
+        lambda: store.sync(KEY),
+        lambda: store.sha256_of(KEY),
+        store.require_writable,
+    ]
+    for step in steps:
+        with pytest.raises(artifacts.StoreAwayError) as raised:
+            step()
+        assert may_pass(raised.value), "a worker waits for it"
+        assert not store.folder.exists()
+    away.rename(store.folder)
+    store.put_file(path, "blobs/new")
+    assert {item.key for item in store.objects()} == {KEY, "blobs/new"}
 
 
 def test_only_what_lies_where_blobs_do_is_listed(stored: ArtifactStore, tmp_path: Path) -> None:
