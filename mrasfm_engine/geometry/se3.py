@@ -62,7 +62,7 @@ def log_so3(rotation: ArrayLike) -> Floats:
 
 
 def quaternion_from_rotation(rotation: ArrayLike) -> Floats:
-    """Unit quaternions (..., 4), x y z w, w >= 0 up to rounding, of rotation matrices (..., 3, 3)."""
+    """Unit quaternions (..., 4), x y z w, w >= 0, of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=np.float64)
     # Shepperd's method: each row is the quaternion times four times one of its components, of which the largest serves.
     rows = (r.reshape(-1, 9) @ _ROWS_FROM_ROTATION + _ROWS_OF_NOTHING).reshape(-1, 4, 4)
