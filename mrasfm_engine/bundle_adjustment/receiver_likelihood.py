@@ -11,9 +11,12 @@ from collections.abc import Callable
 
 import numpy as np
 import scipy.linalg
+from threadpoolctl import ThreadpoolController
 
 from mrasfm_engine.bundle_adjustment.receiver_positions import AXES, ReceiverPositions
 from mrasfm_engine.types import Floats
+
+_THREADS = ThreadpoolController()
 
 
 def restricted_log_likelihood(
@@ -38,7 +41,8 @@ def restricted_log_likelihood(
     count, size, flat = others.shape[2] + 1, scaled.shape[2], scaled.reshape(AXES * len(scaled), -1)
     off, diagonal = declared.precision
     precision = np.diag(diagonal) + np.diag(off[1:], 1) + np.diag(off[1:], -1)
-    values, axes = scipy.linalg.eigh(declared.shares.T @ declared.shares, precision)
+    with _THREADS.limit(limits=1, user_api="blas"):  # others would go on waiting for more long after so little work
+        values, axes = scipy.linalg.eigh(declared.shares.T @ declared.shares, precision)
     values = np.maximum(values, 0.0)
     along = (axes.T @ (declared.shares.T @ scaled.reshape(len(scaled), -1))).reshape(-1, size)
     in_white_noise, log_sigmas = flat.T @ flat, float(np.log(declared.sigma_m).sum())
