@@ -101,7 +101,8 @@ def test_a_page_that_was_opened_while_the_service_was_away_goes_on(open_console:
 
 def test_logging_out_says_where_it_did_not(open_console: Open, world: World) -> None:
     watched = open_console(world.api.url)
-    watched.expected = ("ERR_CONNECTION_REFUSED", "503")
+    # The last: the stream of events ends with the session, and its page asks whose session there is.
+    watched.expected = ("ERR_CONNECTION_REFUSED", "503", "401")
     page = watched.new_page()
     log_in(page, world.api.url, world.client.key)
     page.route("**/v1/session", lambda route: route.abort("connectionrefused"))
