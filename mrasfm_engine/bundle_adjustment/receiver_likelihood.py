@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 from threadpoolctl import ThreadpoolController
 
-from mrasfm_engine.bundle_adjustment.receiver_positions import AXES, ReceiverPositions
+from mrasfm_engine.bundle_adjustment.receiver_positions import AXES, ReceiverPositions, without_common_errors
 from mrasfm_engine.types import Floats
 
 _THREADS = ThreadpoolController()
@@ -50,9 +50,7 @@ def restricted_log_likelihood(
     def log_likelihood(white: float, wander: float) -> float:
         ratio2 = (wander / white) ** 2
         shrunk = np.repeat(ratio2 / (1.0 + ratio2 * values), AXES)[:, None] * along
-        known = (in_white_noise - along.T @ shrunk) / white**2
-        of_common = np.eye(size - count) + known[count:, count:]
-        known = known[:count, :count] - known[:count, count:] @ np.linalg.solve(of_common, known[count:, :count])
+        known, of_common = without_common_errors((in_white_noise - along.T @ shrunk) / white**2, count)
         matrix, right = known[:-1, :-1], known[:-1, -1]
         left = known[-1, -1] - right @ np.linalg.lstsq(matrix, right, rcond=1e-12)[0]
         determinant = 2.0 * (log_sigmas + len(flat) * np.log(white)) + AXES * np.log1p(ratio2 * values).sum()

@@ -266,12 +266,7 @@ class ReceiverPositions:
         """
         count = columns.shape[2]
         known = self._information_by_process(np.concatenate([columns, self.common_m], axis=2))
-        # Positions' common errors may explain some of it.
-        of_common = np.eye(known.shape[0] - count) + known[count:, count:]
-        result: Floats = known[:count, :count] - known[:count, count:] @ np.linalg.solve(
-            of_common, known[count:, :count]
-        )
-        return result
+        return without_common_errors(known, count)[0]
 
     def _information_by_process(self, columns: Floats) -> Floats:
         """The same where positions have no error in common."""
@@ -288,6 +283,15 @@ class ReceiverPositions:
         known = self.information(np.concatenate([way[:, :, None], others], axis=2))
         lost = known[0, 1:] @ np.linalg.pinv(known[1:, 1:], rcond=1e-12, hermitian=True) @ known[1:, 0]
         return max(0.0, float(known[0, 0] - lost))
+
+
+def without_common_errors(known: Floats, count: int) -> tuple[Floats, Floats]:
+    """Information (m, m) of `known` (m + c, m + c) on the first `count` of its ways, without what errors in common
+    explain of it, and I + K' C^-1 K (c, c) of the ways K in which these move positions, C without them.
+    """
+    of_common = np.eye(len(known) - count) + known[count:, count:]
+    result: Floats = known[:count, :count] - known[:count, count:] @ np.linalg.solve(of_common, known[count:, :count])
+    return result, of_common
 
 
 def time_of_process_s(time_s: Floats, segment: Ints | None, wander_time_s: float) -> Floats:

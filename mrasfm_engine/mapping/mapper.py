@@ -24,7 +24,7 @@ from mrasfm_engine.scene.drive import Drive
 from mrasfm_engine.scene.row_bands import RowBands
 from mrasfm_engine.scene.scene import PairMatches
 from mrasfm_engine.scene.state import State
-from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, inlier_members
+from mrasfm_engine.triangulation.tracks import Keypoints, Tracks, count_members, inlier_members, matching_keypoints
 from mrasfm_engine.triangulation.triangulate import Triangulator
 from mrasfm_engine.types import Bools, Floats, Ints
 
@@ -239,8 +239,7 @@ class Mapper:
 
     def matched_keypoints(self, pair: PairMatches, unit: int) -> tuple[Ints, Ints]:
         """Keypoints of a pair's verified matches: those in an image of `unit` first, then those of the other unit."""
-        a = self.keypoints.first[pair.image_a] + pair.matches[pair.inliers, 0].astype(np.int64)
-        b = self.keypoints.first[pair.image_b] + pair.matches[pair.inliers, 1].astype(np.int64)
+        a, b = matching_keypoints(self.keypoints.first, [pair])[0].T
         return (a, b) if self.image_unit[pair.image_a] == unit else (b, a)
 
     def visible_counts(self) -> Ints:
