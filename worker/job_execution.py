@@ -81,7 +81,7 @@ class Runner:
         self._settings = settings
         self._shutting_down = shutting_down
         self._database = Database.from_settings(settings)
-        self._artifacts = ArtifactStore(settings)
+        self._artifacts = ArtifactStore.open(settings, self._database)
         self._job_queue = JobQueue(settings)
         self._owner = f"{socket.gethostname()}:{os.getpid()}"
 

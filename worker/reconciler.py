@@ -52,7 +52,7 @@ class Reconciler:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._database = Database.from_settings(settings)
-        self._artifacts = ArtifactStore(settings)
+        self._artifacts = ArtifactStore.open(settings, self._database)
         self._job_queue = JobQueue(settings)
         self._webhooks = WebhookSender(settings, self._database)
         self._broker_was_there = True

@@ -47,7 +47,8 @@ class Context:
     @classmethod
     def open(cls, settings: Settings) -> Context:
         """Open everything that the settings name; the broker is not asked."""
-        database, artifacts = Database.from_settings(settings), ArtifactStore(settings)
+        database = Database.from_settings(settings)
+        artifacts = ArtifactStore.open(settings, database)
         return cls(
             settings=settings,
             database=database,

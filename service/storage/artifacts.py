@@ -18,13 +18,15 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import unquote, urlsplit
 
 import obstore
 from obstore.store import from_url
 
+from service.database.connections import Database
 from service.settings import Settings
+from service.storage import blobs
 
 _CHUNK_BYTES = 1 << 20
 _DELETE_BATCH = 500
@@ -56,10 +58,10 @@ class ObjectMissingError(FileNotFoundError):
 
 
 class StoreAwayError(ConnectionError):
-    """The store's folder is not there any more: it was moved, or its disk is not mounted. It may come back."""
+    """The store's folder is not there, or is empty: it was moved, or its disk is not mounted. It may come back."""
 
     def __init__(self) -> None:
-        super().__init__(errno.ENOENT, "the folder of the artifact store is not there")
+        super().__init__(errno.ENOENT, "the folder of the artifact store is not there, or holds nothing of it")
 
 
 @dataclass(frozen=True)
@@ -74,21 +76,31 @@ class ArtifactStore:
     """Objects in a folder or in the cloud.
 
     Keys are made by us: relative, with forward slashes. All methods but `stream` block.
+
+    Parameters
+    ----------
+    is_new
+        Asked where the folder holds nothing of a store: whether nothing has been stored yet. Else it is away.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, *, is_new: Callable[[], bool]) -> None:
         url = settings.resolved_artifacts_url
         self._root: Path | None = None
         self._store: Any = None
         self._probed: Any = None
+        self._is_new = is_new
         self._safe_folders: set[Path] = set()
         self._putting = ThreadPoolExecutor(_PUTS, thread_name_prefix="put")  # has no thread before it is used
         if settings.stores_in_folder:
             self._root = Path(unquote(urlsplit(url).path))
-            self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
         else:
             self._store = _open(url, settings, _TIMEOUTS, _RETRIES)
             self._probed = _open(url, settings, _PROBE_TIMEOUTS, _PROBE_RETRIES)
+
+    @classmethod
+    def open(cls, settings: Settings, database: Database) -> ArtifactStore:
+        """The store that the settings name, which is new while the database names no blob."""
+        return cls(settings, is_new=lambda: blobs.none_is_recorded(database))
 
     @property
     def folder(self) -> Path | None:
@@ -163,7 +175,7 @@ class ArtifactStore:
         """
         if self._root is None:
             return
-        self._require_root()
+        self._require_folder()
         path = self._root / key
         _sync(path)
         _sync(path.parent)
@@ -177,14 +189,13 @@ class ArtifactStore:
         digest = hashlib.sha256()
         try:
             if self._root is not None:
-                with (self._root / key).open("rb") as file:
+                with self._missing_is_told(key), (self._root / key).open("rb") as file:
                     while piece := file.read(_CHUNK_BYTES):
                         digest.update(piece)
             else:
                 for chunk in obstore.get(self._store, key).stream(min_chunk_size=_CHUNK_BYTES):
                     digest.update(chunk)
         except FileNotFoundError:
-            self._require_root()
             return None
         return digest.hexdigest()
 
@@ -208,8 +219,9 @@ class ArtifactStore:
         if self._root is not None:
             try:
                 _link_or_copy(self._root / key, target)
-            except FileNotFoundError:  # the system's own does not tell which of the two is missing
-                self._require_in_folder(key)
+            except (FileNotFoundError, NotADirectoryError):  # the system's own does not tell which of the two it is
+                with self._missing_is_told(key):
+                    (self._root / key).stat()
                 raise
             return
         check_stop()
@@ -224,29 +236,37 @@ class ArtifactStore:
                     file.write(chunk)
             os.chmod(target, 0o440)
 
-    def _require_in_folder(self, key: str) -> None:
-        assert self._root is not None
+    @contextlib.contextmanager
+    def _missing_is_told(self, key: str) -> Iterator[None]:
+        """Tell an object that is missing from a folder that is away."""
         try:
-            (self._root / key).stat()
-        except FileNotFoundError:
-            self._require_root()
+            yield
+        except (FileNotFoundError, NotADirectoryError):
+            self._require_folder()
             raise ObjectMissingError(key) from None
 
-    def _require_root(self) -> None:
-        if self._root is not None and not self._root.exists():
+    def _require_folder(self) -> None:
+        """Require the folder of all objects. What was stored while it is away, nobody would find again."""
+        if self._root is None or (self._root / _PREFIX).is_dir():
+            return
+        if not self._is_new():
             raise StoreAwayError
+        self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        (self._root / _PREFIX).mkdir(exist_ok=True, mode=0o700)
 
     def _make_parents(self, target: Path) -> None:
-        """Make the folders above an object, but never the store's own: in a new one, nobody would find it again."""
+        """Make the folders above an object, but not that of all objects."""
         assert self._root is not None
         if target.parent.is_dir():
             return
-        self._require_root()
+        self._require_folder()
         for folder in reversed(target.relative_to(self._root).parents[:-1]):
+            if folder == Path(_PREFIX):
+                continue
             try:
                 (self._root / folder).mkdir(exist_ok=True, mode=0o700)
             except FileNotFoundError:  # it went away meanwhile
-                self._require_root()
+                self._require_folder()
                 raise
 
     def read(self, key: str) -> bytes:
@@ -258,7 +278,8 @@ class ArtifactStore:
             Where the store has no such object.
         """
         if self._root is not None:
-            return (self._root / key).read_bytes()
+            with self._missing_is_told(key):
+                return (self._root / key).read_bytes()
         return bytes(obstore.get(self._store, key).bytes())
 
     async def stream(self, key: str, *, start: int, stop: int) -> AsyncIterator[bytes]:
@@ -270,7 +291,7 @@ class ArtifactStore:
             Where the store has no such object; at the first piece.
         """
         if self._root is not None:
-            file = await asyncio.to_thread((self._root / key).open, "rb")
+            file = await asyncio.to_thread(self._opened, key)
             try:
                 await asyncio.to_thread(file.seek, start)
                 while start < stop:
@@ -286,6 +307,11 @@ class ArtifactStore:
                 end = min(start + 8 * _CHUNK_BYTES, stop)
                 yield bytes(await obstore.get_range_async(self._store, key, start=start, end=end))
                 start = end
+
+    def _opened(self, key: str) -> BinaryIO:
+        assert self._root is not None
+        with self._missing_is_told(key):
+            return (self._root / key).open("rb")
 
     def delete(self, keys: Iterable[str]) -> None:
         """Remove objects; what is not there is no error."""
@@ -322,6 +348,7 @@ class ArtifactStore:
         key = f"probe/{secrets.token_hex(8)}"
         if self._root is not None:
             path = self._root / key
+            self._require_folder()
             self._make_parents(path)
             try:
                 path.write_bytes(b"probe")

@@ -14,6 +14,7 @@ from sqlalchemy import exists as sql_exists
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session, aliased
 
+from service.database.connections import Database
 from service.database.tables import (
     Blob,
     Checkpoint,
@@ -78,6 +79,12 @@ def exists(session: Session, project_id: str, sha256: str) -> bool:
     """Return whether the project has this content."""
     found = select(Blob.id).where(Blob.project_id == project_id, Blob.sha256 == sha256)
     return session.scalar(found) is not None
+
+
+def none_is_recorded(database: Database) -> bool:
+    """Return whether no project has any content yet, or none any more."""
+    with database.read() as session:
+        return session.scalar(select(Blob.id).limit(1)) is None
 
 
 def is_drive_file(blob: type[Blob] = Blob) -> ColumnElement[bool]:

@@ -136,7 +136,7 @@ def test_a_page_outlives_the_service(open_console: Open, tmp_path: Path) -> None
     """The service is killed and started again: the page reaches the job's end by itself."""
     settings = settings_of(tmp_path / "data")
     with api_process(settings, tmp_path) as api:
-        api.context = SimpleNamespace(artifacts=ArtifactStore(settings))
+        api.context = SimpleNamespace(artifacts=ArtifactStore.open(settings, api.database))
         client: Client = api.client()
         job = client.reconstruct(client.frozen(tiny_drive("restart", seed="restart")))
         held = client.claim(job["id"])

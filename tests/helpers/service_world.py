@@ -77,7 +77,7 @@ class World:
         )
         migrated(self.settings)
         self.database = Database.from_settings(self.settings)
-        self.artifacts = ArtifactStore(self.settings)
+        self.artifacts = ArtifactStore.open(self.settings, self.database)
         self._logs = folder / "logs"
         self._logs.mkdir()
         self._started: list[subprocess.Popen[bytes]] = []

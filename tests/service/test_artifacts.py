@@ -38,6 +38,11 @@ def s3_endpoint() -> Iterator[str]:
         yield url
 
 
+def new_store(settings: Settings) -> ArtifactStore:
+    """A store in which nothing has been stored yet."""
+    return ArtifactStore(settings, is_new=lambda: True)
+
+
 @pytest.fixture(params=["folder", "s3"])
 def store_settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Settings:
     if request.param == "folder":
@@ -48,7 +53,7 @@ def store_settings(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: 
 
 @pytest.fixture
 def store(store_settings: Settings) -> ArtifactStore:
-    return ArtifactStore(store_settings)
+    return new_store(store_settings)
 
 
 @pytest.fixture
@@ -210,7 +215,7 @@ def other_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_a_folder_on_another_disk(tmp_path: Path, other_disk: Path) -> None:
     """Where a rename is not possible the bytes are copied, and the copy is whole or not there."""
-    store = ArtifactStore(settings_of(tmp_path / "data"))
+    store = new_store(settings_of(tmp_path / "data"))
     put(store, other_disk / "adopted", CONTENT, KEY)
     assert store.read(KEY) == CONTENT
     assert [item.key for item in store.objects()] == [KEY]
@@ -219,7 +224,7 @@ def test_a_folder_on_another_disk(tmp_path: Path, other_disk: Path) -> None:
 
 
 def test_a_copy_to_another_disk_says_which_of_the_two_is_missing(tmp_path: Path, other_disk: Path) -> None:
-    store = ArtifactStore(settings_of(tmp_path / "data"))
+    store = new_store(settings_of(tmp_path / "data"))
     put(store, tmp_path / "scratch", CONTENT, KEY)
     with pytest.raises(FileNotFoundError) as raised:
         store.fetch(KEY, other_disk / "no folder" / "x")
@@ -254,7 +259,7 @@ def test_a_disk_that_fails_for_a_moment_loses_no_file(
         pytest.skip("no second file system")
     path, tries = folder / f"result-{os.getpid()}", iter(keys)
     path.write_bytes(CONTENT)
-    store = ArtifactStore(settings_of(tmp_path / "data"))
+    store = new_store(settings_of(tmp_path / "data"))
     monkeypatch.setattr(os, "fsync", FailingSync(nth))
     try:
         retry(lambda: store.put_file(path, next(tries)), budget_s=5)
@@ -266,25 +271,50 @@ def test_a_disk_that_fails_for_a_moment_loses_no_file(
 
 
 def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
-    store = ArtifactStore(settings_of(tmp_path / "data"))
-    assert store.folder is not None
-    store.folder.rmdir()
-    store.folder.write_bytes(b"a file in its place")
-    with pytest.raises(OSError, match="directory"):
-        store.require_writable()
+    settings = settings_of(tmp_path / "data")
+    settings.data_dir.mkdir()
+    (settings.data_dir / "artifacts").write_bytes(b"a file in its place")
+    with pytest.raises(OSError, match=r"directory|exists"):
+        new_store(settings).require_writable()
 
 
-def test_a_folder_that_is_moved_away_is_not_made_anew(tmp_path: Path) -> None:
+def leave_nothing(folder: Path) -> None:
+    """Move the store away with its folder."""
+
+
+def leave_mount_point(folder: Path) -> None:
+    """Unmount the store's disk."""
+    folder.mkdir()
+
+
+def leave_file(folder: Path) -> None:
+    folder.write_bytes(b"")
+
+
+@pytest.mark.parametrize("leave", [leave_nothing, leave_mount_point, leave_file])
+@pytest.mark.parametrize("starts_meanwhile", [False, True])
+def test_a_folder_that_is_away_is_not_made_anew(
+    tmp_path: Path, leave: Callable[[Path], None], starts_meanwhile: bool
+) -> None:
     """What would be stored in a new one is lost when the old one comes back."""
-    store = ArtifactStore(settings_of(tmp_path / "data"))
+    settings = settings_of(tmp_path / "data")
+    contents: list[str] = []
+    store = ArtifactStore(settings, is_new=lambda: not contents)
     put(store, tmp_path / "scratch", CONTENT, KEY)
-    assert store.folder is not None
-    away = store.folder.rename(tmp_path / "away")
+    contents.append(KEY)
+    if starts_meanwhile:
+        store = ArtifactStore(settings, is_new=lambda: not contents)
+    folder = settings.data_dir / "artifacts"
+    away = folder.rename(tmp_path / "away")
+    leave(folder)
+    before = sorted(tmp_path.rglob("*"))
     path = tmp_path / "new"
     path.write_bytes(b"new")
     steps: list[Callable[[], object]] = [
         lambda: store.put_file(path, "blobs/new"),
         lambda: store.fetch(KEY, tmp_path / "fetched"),
+        lambda: store.read(KEY),
+        lambda: read(store, 0, 5),
         lambda: store.sync(KEY),
         lambda: store.sha256_of(KEY),
         store.require_writable,
@@ -293,8 +323,10 @@ def test_a_folder_that_is_moved_away_is_not_made_anew(tmp_path: Path) -> None:
         with pytest.raises(artifacts.StoreAwayError) as raised:
             step()
         assert may_pass(raised.value), "a worker waits for it"
-        assert not store.folder.exists()
-    away.rename(store.folder)
+    assert sorted(tmp_path.rglob("*")) == sorted([*before, path])
+    if folder.is_file():
+        folder.unlink()
+    away.rename(folder)
     store.put_file(path, "blobs/new")
     assert {item.key for item in store.objects()} == {KEY, "blobs/new"}
 
@@ -315,7 +347,7 @@ def store_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int],
 
     def make(port: int) -> ArtifactStore:
         endpoint = f"http://{HOST}:{port}"
-        return ArtifactStore(settings_of(tmp_path / "data", artifacts_url="s3://bucket", s3_endpoint=endpoint))
+        return new_store(settings_of(tmp_path / "data", artifacts_url="s3://bucket", s3_endpoint=endpoint))
 
     return make
 

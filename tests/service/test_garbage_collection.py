@@ -242,8 +242,8 @@ def _name_blobs(session: Session, project_id: str) -> None:
 
 
 @pytest.fixture
-def artifacts(database_settings: Settings) -> ArtifactStore:
-    return ArtifactStore(database_settings)
+def artifacts(database_settings: Settings, database: Database) -> ArtifactStore:
+    return ArtifactStore.open(database_settings, database)
 
 
 def _put(artifacts: ArtifactStore, tmp_path: Path, key: str) -> str:

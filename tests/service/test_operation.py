@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
 import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -75,7 +75,6 @@ def test_alive_and_ready(api: Api) -> None:
 def test_not_ready_without_the_artifact_store(start_api: StartApi) -> None:
     api = start_api()
     folder = api.settings.data_dir / "artifacts"
-    shutil.rmtree(folder)
     folder.write_bytes(b"")
     problem = problem_of(httpx.get(f"{api.url}/readyz"), 503, "not-ready")
     assert "artifact store" in problem["detail"]
@@ -291,3 +290,24 @@ def test_a_store_that_is_away_is_said_so(start_api: StartApi, monkeypatch: pytes
     problem_of(client.post("/v1/drives", content=tiny_drive().raw), 503, "store-unavailable")
     problem_of(client.get("/readyz"), 503, "not-ready")
     assert client.get("/v1/drives").json()["items"] == []
+
+
+def test_a_service_that_starts_while_its_folder_of_objects_is_away_waits_for_it(
+    start_api: StartApi, tmp_path: Path
+) -> None:
+    """As after a restart of the machine where the disk is mounted later, or not at all."""
+    drive = tiny_drive()
+    path, data = next(iter(drive.files.items()))
+    before = start_api().client()
+    drive_id = before.create(drive)
+    folder = before.api.settings.data_dir / "artifacts"
+    away = folder.rename(tmp_path / "away")
+    folder.mkdir()
+    client = start_api().client_of(before.project_id, before.key)
+    url = f"/v1/drives/{drive_id}/files/{path}"
+    problem_of(client.get("/readyz"), 503, "not-ready")
+    problem_of(client.put(url, content=data), 503, "store-unavailable")
+    problem_of(client.get(f"/v1/drives/{drive_id}/manifest"), 503, "store-unavailable")
+    away.rename(folder)
+    assert client.get(f"/v1/drives/{drive_id}/manifest").content == drive.raw
+    assert client.put(url, content=data).status_code == 201
