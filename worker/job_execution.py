@@ -69,7 +69,7 @@ T = TypeVar("T")
 
 
 class Runner:
-    """Executes jobs, one at a time, in this process.
+    """Executes jobs, one at a time, in this process, which has database and store from its start on.
 
     Parameters
     ----------
@@ -82,6 +82,7 @@ class Runner:
         self._shutting_down = shutting_down
         self._database = Database.from_settings(settings)
         self._artifacts = ArtifactStore.open(settings, self._database)
+        self._artifacts.require_folder()
         self._job_queue = JobQueue(settings)
         self._owner = f"{socket.gethostname()}:{os.getpid()}"
 

@@ -175,7 +175,7 @@ class ArtifactStore:
         """
         if self._root is None:
             return
-        self._require_folder()
+        self.require_folder()
         path = self._root / key
         _sync(path)
         _sync(path.parent)
@@ -242,11 +242,21 @@ class ArtifactStore:
         try:
             yield
         except (FileNotFoundError, NotADirectoryError):
-            self._require_folder()
+            self.require_folder()
             raise ObjectMissingError(key) from None
 
-    def _require_folder(self) -> None:
-        """Require the folder of all objects. What was stored while it is away, nobody would find again."""
+    def require_folder(self) -> None:
+        """Require that the folder of all objects is not away: what was stored meanwhile, nobody would find again.
+
+        A new store gets one.
+
+        Raises
+        ------
+        StoreAwayError
+            Where it is away.
+        OSError
+            Where it cannot be made.
+        """
         if self._root is None or (self._root / _PREFIX).is_dir():
             return
         if not self._is_new():
@@ -259,14 +269,14 @@ class ArtifactStore:
         assert self._root is not None
         if target.parent.is_dir():
             return
-        self._require_folder()
+        self.require_folder()
         for folder in reversed(target.relative_to(self._root).parents[:-1]):
             if folder == Path(_PREFIX):
                 continue
             try:
                 (self._root / folder).mkdir(exist_ok=True, mode=0o700)
             except FileNotFoundError:  # it went away meanwhile
-                self._require_folder()
+                self.require_folder()
                 raise
 
     def read(self, key: str) -> bytes:
@@ -348,7 +358,7 @@ class ArtifactStore:
         key = f"probe/{secrets.token_hex(8)}"
         if self._root is not None:
             path = self._root / key
-            self._require_folder()
+            self.require_folder()
             self._make_parents(path)
             try:
                 path.write_bytes(b"probe")
