@@ -297,7 +297,7 @@ class AggregationConfig(_Section):
         36, description="points that two scenes share at a seam: as many as `min_units` units see at least"
     )
     max_scale_error: Positive = Field(
-        0.05, description="largest difference of the scales of two scenes, beyond their uncertainty"
+        0.05, description="largest difference of the lengths of two scenes, beyond three of the sigmas that they state"
     )
     multi_scene_adjustment: bool = Field(
         True,

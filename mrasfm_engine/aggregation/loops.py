@@ -56,9 +56,13 @@ class ScenePaths:
     sigma_scale: float = 0.0
 
     @staticmethod
-    def from_scene(scene: SourceScene, *, most_scale: float) -> ScenePaths:
-        """The paths through a scene, of which seams let scales differ by up to `most_scale`."""
-        largest = UNKNOWN_SCALE_SHARE * most_scale
+    def from_scene(scene: SourceScene, *, most_scale: float, seen: float = 0.0) -> ScenePaths:
+        """The paths through a scene, of which seams let scales differ by up to `most_scale`.
+
+        `seen` is the largest difference that seams of the scene show: where it is beyond `most_scale`, the scene states
+        an uncertainty that allows it.
+        """
+        largest = UNKNOWN_SCALE_SHARE * most_scale if seen <= most_scale else seen
         sigma = largest if scene.sigma_scale is None else min(scene.sigma_scale, largest)
         return ScenePaths(trajectory_m=scene.trajectory_m, sigma_scale=sigma)
 

@@ -130,7 +130,8 @@ def say_findings(run: stages.Run, result: MapResult) -> None:
 
 def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Finding:
     """Finding on a map without a seam in use, by the seams that every pair of scenes by itself says."""
-    off_m = [seam.quality.get("positions_off_m", 0.0) for seam in found if len(seam.shared) >= settings.min_inliers]
+    sharing = [seam for seam in found if len(seam.shared) >= settings.min_inliers]
+    off_m = [seam.quality.get("positions_off_m", 0.0) for seam in sharing]
     above_m = max((seam.quality.get("height_between_m", 0.0) for seam in found), default=0.0)
     if any(seam.accepted for seam in found):
         why, remedy = "no seam is left to use", "See the loops that do not close."
@@ -148,6 +149,10 @@ def nothing_connected(found: Sequence[Seam], settings: AggregationConfig) -> Fin
     elif above_m > settings.position_error_m:
         why = f"positions put scenes that meet above one another, by up to {above_m:.0f} m"
         remedy = "Compare the height datums of their drives, in gnss.height_datum."
+    elif sharing:
+        best = max(sharing, key=lambda seam: len(seam.shared))
+        why = f"{best.a} and {best.b} see the same, but {best.reason}"
+        remedy = "The seams in map.json have the reason of every pair; aggregation has a setting for each threshold."
     else:
         why = "no two of them see the same"
         remedy = "Give drives whose trajectories meet, in similar light, or check their positions."

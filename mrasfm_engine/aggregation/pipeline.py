@@ -143,7 +143,14 @@ def _graph(
     graph, loops = SeamGraph(
         list(by_name),
         seams,
-        paths=[ScenePaths.from_scene(scene, most_scale=config.aggregation.max_scale_error) for scene in found],
+        paths=[
+            ScenePaths.from_scene(
+                scene,
+                most_scale=config.aggregation.max_scale_error,
+                seen=max((seam.off_in_length for seam in seams if scene.name in (seam.a, seam.b)), default=0.0),
+            )
+            for scene in found
+        ],
         off_positions=lambda k: _off_positions(seams[k], by_name[seams[k].a], by_name[seams[k].b]),
     ).without_contradictions()
     graph = graph.without(contradicted_by_positions(graph, found, config.aggregation))

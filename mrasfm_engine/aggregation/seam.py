@@ -32,6 +32,7 @@ from mrasfm_engine.types import CountProgress, Floats, Ints
 BATCH_UNITS = 4  # relocalised between two tests of their agreement
 ENOUGH_AGREEING = 4  # units, after which no more are looked for
 ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
+SIGMAS_OF_LENGTH = 3.0  # by which lengths may differ beyond `aggregation.max_scale_error`
 MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # it averages over the bends of both scenes there
 NO_COMMON_VIEWS = "their views do not overlap"
@@ -54,6 +55,11 @@ class Seam:
     units_b: Ints
     place_b_m: Floats  # (3,) the middle of b's units there, in b's frame
     quality: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def off_in_length(self) -> float:
+        """Relative difference of the scenes' lengths; zero where the seam is not used or does not know it."""
+        return abs(float(self.quality.get("scale", 1.0)) - 1.0) if self.accepted else 0.0
 
     def pack(self) -> tuple[Arrays, dict[str, Any]]:
         """Arrays and report for a finished stage; names are not part of them."""
@@ -202,7 +208,8 @@ def _judged(
     at = _middle_m(b, units_b)
     covariance = _about(refined.covariance, b, refined.a_from_b, at)
     apart_m = se3.apply(refined.a_from_b, at[None])[0] - _middle_m(a, units_a)
-    covariance[3:, 3:] += np.outer(apart_m, apart_m) * _difference_of_lengths(scale, sigma_scale, settings) ** 2
+    most = _largest_difference_of_lengths(a, b, settings)
+    covariance[3:, 3:] += np.outer(apart_m, apart_m) * min(max(abs(scale - 1.0), sigma_scale), most) ** 2
     stated = with_bends(covariance)
     shift = float(np.linalg.norm(se3.apply(refined.a_from_b, at[None])[0] - se3.apply(coarse, at[None])[0]))
     turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ coarse[:3, :3].T))
@@ -221,7 +228,7 @@ def _judged(
     }
     if by_positions is not None:
         quality |= {"positions_off_m": shift, "positions_off_deg": turn}
-    reason = _why_not(found, refined, at, quality, settings.agreeing_units, config)
+    reason = _why_not(found, refined, at, quality, settings.agreeing_units, most, config)
     return Seam(
         a=a.name,
         b=b.name,
@@ -244,9 +251,10 @@ def _why_not(
     at: Floats,
     quality: dict[str, Any],
     strict: bool,
+    most: float,
     config: EngineConfig,
 ) -> str:
-    """Reason against trusting a seam; empty where there is none."""
+    """Reason against trusting a seam of scenes whose lengths may differ by up to `most`; empty where there is none."""
     settings = config.aggregation
     if quality["inliers"] < settings.min_inliers:
         return f"only {quality['inliers']} points are shared, {settings.min_inliers} are needed"
@@ -262,8 +270,8 @@ def _why_not(
     turn = float(se3.rotation_angle_deg(refined.a_from_b[:3, :3] @ found.a_from_b[:3, :3].T))
     if shift > MAX_SHIFT_M or turn > MAX_TURN_DEG:
         return f"what is shared contradicts the units that agree, by {shift:.2f} m and {turn:.2f} deg"
-    off, unsure = abs(quality["scale"] - 1.0), 3.0 * quality["sigma_scale"]
-    if off > settings.max_scale_error + unsure:
+    off, unsure = abs(quality["scale"] - 1.0), SIGMAS_OF_LENGTH * quality["sigma_scale"]
+    if off > most + unsure:
         return f"lengths of the scenes differ by {100 * off:.1f} %"
     if quality.get("positions_off_m", 0.0) > settings.position_error_m:
         return (
@@ -302,12 +310,14 @@ def _about(covariance: Floats, b: SourceScene, a_from_b: Floats, at_b: Floats) -
     return result
 
 
-def _difference_of_lengths(scale: float, sigma_scale: float, settings: AggregationConfig) -> float:
-    """Relative difference of the scenes' lengths, that the way between their vehicles at the seam may be off by.
+def _largest_difference_of_lengths(a: SourceScene, b: SourceScene, settings: AggregationConfig) -> float:
+    """Largest relative difference of the lengths of two scenes, by what they state of them.
 
-    Where both drove at one place there is none: points that are too far on the same line of sight move in no image.
+    The way between their vehicles at a seam may be off by that much. Where both drove at one place there is no such
+    error: points that are too far on the same line of sight move in no image.
     """
-    return min(max(abs(scale - 1.0), sigma_scale), settings.max_scale_error)
+    stated = np.hypot(a.sigma_scale or 0.0, b.sigma_scale or 0.0)
+    return settings.max_scale_error + SIGMAS_OF_LENGTH * float(stated)
 
 
 def with_bends(covariance: Floats) -> Floats:

@@ -37,7 +37,7 @@ from schemas.findings import Finding, as_json, listed, warning
 
 FAR_APART_M = 50_000.0
 MIN_DRIVES = 2
-SEAM_VERSION, SCALES_VERSION = 7, 2  # see `mrasfm_engine.stages.VERSIONS`
+SEAM_VERSION, SCALES_VERSION = 8, 2  # see `mrasfm_engine.stages.VERSIONS`
 
 
 @dataclass

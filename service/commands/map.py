@@ -120,6 +120,6 @@ def _say(version: MapVersionResource, conversation: Conversation) -> None:
     conversation.say(f"map {version.map_id}, version {version.number}: {url}")
     conversation.say(f"  {version.summary.connected} of {version.summary.scenes} scenes are connected")
     for name in version.unconnected:
-        conversation.say(f"  warning: {name} overlaps no other, and lies where its GNSS puts it")
+        conversation.say(f"  warning: no seam joins {name} to another scene; it lies where its GNSS puts it")
     for drive in version.failed:
         conversation.say(f"  warning: {drive.name} ({drive.drive_id}) is not in it: {drive.problem.detail}")

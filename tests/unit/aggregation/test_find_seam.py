@@ -216,6 +216,22 @@ def test_lengths_that_differ_are_found_and_refused_beyond_the_limit(
     assert not strict.accepted
     assert strict.reason.startswith("lengths of the scenes differ by")
     assert 2.4 < float(strict.reason.split()[-2]) < 3.6
+    assert strict.off_in_length == 0.0
+
+
+@pytest.mark.parametrize(("sigma", "accepted"), [(0.001, False), (0.01, True)])
+def test_lengths_may_differ_by_what_scenes_state_of_them(
+    street: Street, folder: Path, a: Driven, sigma: float, accepted: bool
+) -> None:
+    other = drive_along(street, folder / f"stated{sigma}", WAY_B, scale=0.97, seed=5)
+    report = {"scale": {"sigma_relative": sigma}}
+    stated = [replace(one, source=replace(one.source, report=one.source.report | report)) for one in (a, other)]
+    seam = seam_of(stated[0], stated[1], configured(max_scale_error=0.01))
+    assert seam.accepted == accepted, seam.reason
+    assert seam.off_in_length == pytest.approx(0.03 if accepted else 0.0, abs=0.006)
+    if not accepted:
+        finding = nothing_connected([seam], CONFIG.aggregation)
+        assert finding.what.endswith(f"{seam.a} and {seam.b} see the same, but {seam.reason}")
 
 
 def test_where_lengths_differ_vehicles_at_different_places_are_less_certain_of_their_distance(
