@@ -206,9 +206,13 @@ def _rejected(scene: Scene, stages: Sequence[Mapping[str, Any]]) -> str:
     if off_road:
         lines.append(f"{number(off_road)} points off the surface of the road")
     lines += [f"{_named(mapping[name])}: {what}" for name, what in _LISTS.items() if mapping.get(name)]
+    between = refinement.get("between_keyframes", {})
+    told = [*mapping.get("units_not_registered", ()), *between.get("units_not_registered", ())]
+    reason = {entry["unit"]: entry["reason"] for entry in told}
     missing = np.flatnonzero(~scene.unit_registered).tolist()
     if missing:
-        lines.append(f"{number(len(missing))} units without a pose: {_named(missing)}")
+        named = [f"{unit} ({reason[unit]})" if unit in reason else unit for unit in missing]
+        lines.append(f"{number(len(missing))} units without a pose: {_named(named)}")
     return section("Rejected, and why", items(lines) if lines else "<p>Nothing.</p>\n")
 
 

@@ -32,7 +32,12 @@ REPORT: dict[str, Any] = {
     "findings": [{"severity": "warning", "code": "gnss-jump", "what": "GNSS jumps & returns", "remedy": "Nothing."}],
     "stages": [
         {"stage": "matches", "seconds": 1.25, "reused": True, "rejected_pairs": {"few matches": 3}},
-        {"stage": "mapping", "seconds": 2.5, "images_occluded": ["left/001.png"]},
+        {
+            "stage": "mapping",
+            "seconds": 2.5,
+            "images_occluded": ["left/001.png"],
+            "units_not_registered": [{"unit": 1, "source_frame": 1, "reason": "its images have 0 keypoints"}],
+        },
         {"stage": "refinement", "seconds": 4.0, "scale": {"sigma_relative": 0.0123, "from": "the rig"}},
     ],
 }
@@ -104,7 +109,7 @@ def test_what_was_rejected_is_named_with_its_reason(page: str) -> None:
         "few matches",
         "left/001.png",
         "images that something covers",
-        "units without a pose",
+        "units without a pose: 1 (its images have 0 keypoints)",
         "1.25",
         "(reused)",
     ):
