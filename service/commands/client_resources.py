@@ -156,11 +156,15 @@ def _print(conversation: Conversation, summary: Summary, items: Iterable[BaseMod
         shown = item.model_dump(mode="json")
         summary.items.append(shown)
         if not conversation.arguments.json:
-            words = [str(shown[name]) for name in _SHOWN if shown.get(name) not in (None, "")]
+            words = [_word(shown[name]) for name in _SHOWN if shown.get(name) not in (None, "")]
             print("  ".join([shown["id"], *words, *_of_drive(shown), *_of_job(shown)]), flush=True)
     if next(rest, None) is not None:
         conversation.say(f"there are more than these {limit}: --limit lists them")
     return 0
+
+
+def _word(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _of_drive(shown: dict[str, Any]) -> list[str]:

@@ -264,6 +264,8 @@ def test_commands(
     assert (code, (tmp_path / "out" / "report.json").read_bytes()) == (0, b"{}")
     assert run(client, capsys, "download", scene_id, "--out", str(tmp_path / "scene"))[0] == 0
     assert run(client, capsys, "show", export["id"])[1]["items"][0]["state"] == "SUCCEEDED"
+    assert main(["list", "exports", "--url", client.api.url]) == 0
+    assert capsys.readouterr().out.startswith(f"{export['id']}  SUCCEEDED  kitti  ")
     assert run(client, capsys, "delete", export["id"])[0] == 0
     other = run(client, capsys, "export", scene_id, "--format", "kitti", "--out", str(tmp_path / "scene"))
     assert (other[0], f"holds the scene {scene_id}" in other[1]["error"]) == (2, True), "before the wait"
