@@ -205,7 +205,7 @@ def _rejected(scene: Scene, stages: Sequence[Mapping[str, Any]]) -> str:
     lines += [f"{number(count)} tracks: {text(why)}" for why, count in tracks.items() if count]
     if off_road:
         lines.append(f"{number(off_road)} points off the surface of the road")
-    lines += [f"{_named(mapping[name])}: {what}" for name, what in _LISTS.items() if mapping.get(name)]
+    lines += [f"{_named(_files(mapping[name]))}: {what}" for name, what in _LISTS.items() if mapping.get(name)]
     between = refinement.get("between_keyframes", {})
     told = [*mapping.get("units_not_registered", ()), *between.get("units_not_registered", ())]
     reason = {entry["unit"]: entry["reason"] for entry in told}
@@ -221,6 +221,10 @@ _LISTS = {
     "images_dark_or_without_texture": "images that are dark or without texture",
     "images_posed_by_their_unit_alone": "images that only their unit gives a pose",
 }
+
+
+def _files(images: Sequence[str | Mapping[str, Any]]) -> list[str]:
+    return [image if isinstance(image, str) else str(image["file"]) for image in images]
 
 
 def _named(values: Sequence[Any]) -> str:

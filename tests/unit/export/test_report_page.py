@@ -35,7 +35,7 @@ REPORT: dict[str, Any] = {
         {
             "stage": "mapping",
             "seconds": 2.5,
-            "images_occluded": ["left/001.png"],
+            "images_occluded": [{"file": "left/001.png", "unit": 1, "camera": "left"}],
             "units_not_registered": [{"unit": 1, "source_frame": 1, "reason": "its images have 0 keypoints"}],
         },
         {"stage": "refinement", "seconds": 4.0, "scale": {"sigma_relative": 0.0123, "from": "the rig"}},
@@ -107,8 +107,7 @@ def test_every_correction_is_there_exactly_and_rounded_as_its_sigma(written: Pat
 def test_what_was_rejected_is_named_with_its_reason(page: str) -> None:
     for words in (
         "few matches",
-        "left/001.png",
-        "images that something covers",
+        "left/001.png: images that something covers",
         "units without a pose: 1 (its images have 0 keypoints)",
         "1.25",
         "(reused)",
