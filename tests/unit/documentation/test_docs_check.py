@@ -95,3 +95,11 @@ def test_examples_of_settings_are_valid() -> None:
 
 def test_readme_is_short() -> None:
     assert len((REPOSITORY / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+def test_test_files_that_the_documentation_names_exist() -> None:
+    page = (REPOSITORY / "docs" / "development" / "testing.md").read_text()
+    named = re.findall(r"`([a-z_/0-9]+/test_[a-z_0-9]+\.py)`", page)
+    assert len(named) > 20
+    folders = (REPOSITORY, REPOSITORY / "tests" / "unit")
+    assert [file for file in named if not any((folder / file).is_file() for folder in folders)] == []
