@@ -237,8 +237,8 @@ class BundleAdjustmentConfig(_Section):
     refine_focal: bool | None = Field(
         None,
         description="the intrinsics of each camera's model vary with their priors where the drive observes the focal "
-        "length: those of several cameras where `rig_from_cam` varies too; by default those of a single camera, and of "
-        "cameras for which the manifest declares a sigma of any of them",
+        "length: those of several cameras where `rig_from_cam` varies too; by default those of a single camera, of "
+        "cameras for which the manifest declares a sigma of any of them, and of all where lenses bend the scene",
     )
     min_heading_change_deg: Positive = Field(
         15.0,

@@ -29,6 +29,7 @@ from mrasfm_engine.mapping.refinement_result import (
 )
 from mrasfm_engine.mapping.road import drop_off_road
 from mrasfm_engine.mapping.time_offsets import offsets_are_steady, times_may_vary
+from mrasfm_engine.mapping.undeclared_lenses import free_bending_lenses
 from mrasfm_engine.types import Bools, Cancel, CountProgress
 
 ROUNDS = 2  # of adjusting, triangulating anew and filtering,
@@ -46,7 +47,7 @@ def adjust_in_rounds(
     """Adjust, triangulate anew and filter, until the weights of positions and the cameras' time offsets are steady."""
     _rescale(mapper, result, terms_of(mapper, result))
     steady = _unbend(mapper, result, free_units, cancel)
-    done, is_last = 0, False
+    done, is_last, heard = 0, False, False
     while not is_last:
         result.sigma_px = observation_sigma_px(mapper)
         is_last = done == MAX_ROUNDS - 1 or (done >= ROUNDS - 1 and steady)
@@ -55,8 +56,11 @@ def adjust_in_rounds(
         offset_s = mapper.state.camera_time_offset_s
         adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
         steady = reassess_positions(mapper, result) and offsets_are_steady(mapper, offset_s)
-        if done == 0:
+        if done == 0 and free_bending_lenses(mapper, result, free_units, cancel=cancel):
+            steady = False
+        elif not heard:
             hear_given_rotations(mapper, result, free_units)
+            heard = True
         choose_observations(mapper, result, is_last=is_last)
         done += 1
         if progress is not None:

@@ -133,8 +133,9 @@ def assess_intrinsics(
 ) -> IntrinsicsDecision:
     """Free the intrinsics that the models of cameras have where the drive observes the focal length.
 
-    A single pinhole camera, and those whose intrinsics the manifest declares uncertain, have a model with distortion
-    from then on if they are free: what rectified images have left of it would else pass for a part of the focal length.
+    Pinhole cameras have a model with distortion from then on if they are free: what rectified images have left of it
+    would else pass for a part of the focal length. Where the settings ask for all cameras, that are a single one and
+    those whose intrinsics the manifest declares uncertain.
 
     Parameters
     ----------
@@ -143,8 +144,9 @@ def assess_intrinsics(
     free_units, terms, options, cancel
         Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
     """
-    given, is_single = mapper.drive.manifest.rig, mapper.drive.has_single_camera
-    may_be_distorted = asked & np.array([is_single or camera.declares_intrinsics for camera in given.cameras])
+    given = mapper.drive.manifest.rig
+    by_default = mapper.config.bundle_adjustment.refine_focal is None or mapper.drive.has_single_camera
+    may_be_distorted = asked & np.array([by_default or camera.declares_intrinsics for camera in given.cameras])
     take_models(mapper, given, may_be_distorted)
     decision = _decided(mapper, asked, free_units=free_units, terms=terms, options=options, cancel=cancel)
     take_models(mapper, given, may_be_distorted & decision.distortion_varies)
