@@ -56,6 +56,7 @@ def _are_open(mapper: Mapper, result: Refinement) -> bool:
     return (
         result.calibration.free
         and settings.camera_set_adjustment
+        and settings.priors
         and settings.reassessment
         and settings.refine_focal is None
         and not result.intrinsics_are_asked
@@ -92,6 +93,8 @@ def _bend_px(mapper: Mapper, problem: Problem) -> float:
     step[~is_lens] = -np.linalg.solve(known[np.ix_(~is_lens, ~is_lens)], moved)
     before_m = problem.state.unit_position_m[free]
     after_m = before_m - (eliminated.coupled @ step).reshape(-1, UNIT_DOF)[:, 3:]
+    if not np.isfinite(after_m).all():
+        return 0.0
     bend_m = align_similarity(before_m, after_m).apply(after_m) - before_m
     from_middle_m = before_m - before_m.mean(axis=0)
     focal_px = float(mapper.state.camera_params[:, :2].mean())
