@@ -55,11 +55,12 @@ def adjust_in_rounds(
             weigh_shared_errors(mapper, result)
         offset_s = mapper.state.camera_time_offset_s
         adjust(mapper, result, free_units, rough=not is_last, cancel=cancel)
-        steady = reassess_positions(mapper, result) and offsets_are_steady(mapper, offset_s)
         if done == 0 and free_bending_lenses(mapper, result, free_units, cancel=cancel):
-            steady = False
-        elif not heard:
-            hear_given_rotations(mapper, result, free_units)
+            steady = False  # a bent scene judges nothing
+        else:
+            steady = reassess_positions(mapper, result) and offsets_are_steady(mapper, offset_s)
+            if not heard:
+                hear_given_rotations(mapper, result, free_units)
             heard = True
         choose_observations(mapper, result, is_last=is_last)
         done += 1
