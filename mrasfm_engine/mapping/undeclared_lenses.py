@@ -47,6 +47,7 @@ def free_bending_lenses(mapper: Mapper, result: Refinement, free_units: Bools, *
     if not decision.free.any():
         return False
     result.intrinsics = decision
+    result.absolute.doubted_lever = None  # a bend looks like an antenna that is elsewhere: it is judged anew
     return True
 
 
