@@ -4,6 +4,9 @@ Lens models are off by tenths of a pixel, and cameras and units turn by as much 
 that adds up from unit to unit, and bends it. One Gauss-Newton step in which all intrinsics vary under their priors says
 by how much. Where it looks like more than lenses usually are off by, from as far away as units lie from their middle,
 the intrinsics vary if the drive observes the focal length, as those do that the manifest declares uncertain.
+
+What a vehicle does between two units, which images of other times and rolling shutters show, is interpolated. In a turn
+the error of that looks like one of a lens: such drives keep their lenses.
 """
 
 from __future__ import annotations
@@ -62,6 +65,7 @@ def _are_open(mapper: Mapper, result: Refinement) -> bool:
         and settings.refine_focal is None
         and not result.intrinsics_are_asked
         and not mapper.drive.has_single_camera
+        and mapper.state.simultaneous
         and not has_few_units(mapper)
     )
 

@@ -62,3 +62,12 @@ def test_lenses_that_hardly_bend_it_stay_as_given(cameras: int, straight: bool, 
     assert not result.intrinsics_are_asked
     assert {camera.model for camera in mapper.drive.cameras} == {"PINHOLE"}
     np.testing.assert_array_equal(mapper.state.unit_position_m, held.state.unit_position_m)
+
+
+@pytest.mark.slow
+def test_a_drive_whose_motion_is_interpolated_keeps_its_lenses() -> None:
+    """What is wrong with that looks the same in a turn."""
+    simulated = distorted(make_simulated_drive(units=UNITS, cameras=2, points=2500, readout_ms=25))
+    mapper, result = refined(simulated)
+    assert not mapper.state.simultaneous
+    assert not result.intrinsics_are_asked
