@@ -29,9 +29,9 @@ THREADS = os.cpu_count() or 1
 def correspondence(data: Path, work: Path, repeat: int) -> Iterator[Figure]:
     """Line 16. Inliers of both are those that COLMAP's verification finds among the matches of either.
 
-    Images are extracted at a size at which they have three quarters of the keypoints, so that inliers are fewer. At full
-    size images have more keypoints than are wanted: the strongest ones, as COLMAP's, have as many inliers. Those that
-    cover the image, which are taken by default, have fewer.
+    Images are extracted at a size at which they have three quarters of the keypoints, so that inliers are fewer. At
+    full size they have more keypoints than are wanted: the strongest ones, as COLMAP's, have as many inliers. Those
+    that cover the image, which are taken by default, have fewer.
     """
     drive = imported(data, "kitti06", work)
     out = work / "correspondence"
