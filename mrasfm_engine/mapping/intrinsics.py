@@ -134,8 +134,8 @@ def assess_intrinsics(
     """Free the intrinsics that the models of cameras have where the drive observes the focal length.
 
     Pinhole cameras have a model with distortion from then on if they are free: what rectified images have left of it
-    would else pass for a part of the focal length. Where the settings ask for all cameras, that are a single one and
-    those whose intrinsics the manifest declares uncertain.
+    would else pass for a part of the focal length. Where `refine_focal` asks for all cameras, only a single one has it,
+    and those whose intrinsics the manifest declares uncertain.
 
     Parameters
     ----------

@@ -19,7 +19,12 @@ from mrasfm_engine.bundle_adjustment.problem import PLACES_OF_INTRINSICS, UNIT_D
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.geometry.alignment import align_similarity
 from mrasfm_engine.mapping.calibration import has_few_units
-from mrasfm_engine.mapping.intrinsics import assess_intrinsics, intrinsics_prior, problem_of_all_intrinsics
+from mrasfm_engine.mapping.intrinsics import (
+    BEYOND_PRIOR_SIGMAS,
+    assess_intrinsics,
+    intrinsics_prior,
+    problem_of_all_intrinsics,
+)
 from mrasfm_engine.mapping.lens_errors import LENS_SIGMA_PX
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement_result import Refinement, solver_options, terms_of
@@ -96,6 +101,9 @@ def _bend_px(mapper: Mapper, problem: Problem) -> float:
     # The others follow the lenses, and not what the adjustment has left of a step without them.
     moved = known[np.ix_(~is_lens, is_lens)] @ step[is_lens]
     step[~is_lens] = -np.linalg.solve(known[np.ix_(~is_lens, ~is_lens)], moved)
+    chi2, parameters = float(step[is_lens] @ (known @ step)[is_lens]), int(is_lens.sum())
+    if not chi2 > parameters + BEYOND_PRIOR_SIGMAS * np.sqrt(2.0 * parameters):
+        return 0.0  # right lenses would show as much by what keypoints err by
     before_m = problem.state.unit_position_m[free]
     after_m = before_m - (eliminated.coupled @ step).reshape(-1, UNIT_DOF)[:, 3:]
     if not np.isfinite(after_m).all():

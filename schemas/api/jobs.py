@@ -36,8 +36,8 @@ class ReconstructionSettings(RequestBody):
     refine_calibration: bool | None = Field(None, description="rig_from_cam, where the drive makes it observable")
     refine_focal: bool | None = Field(
         None,
-        description="intrinsics, where the drive observes focal lengths; by default of a single camera, and of cameras "
-        "for which the manifest declares a sigma of any of them",
+        description="intrinsics, where the drive observes focal lengths; by default of a single camera, of cameras "
+        "for which the manifest declares a sigma of any of them, and of all where lenses bend the scene",
     )
     seed: Annotated[int, Field(ge=0, le=2**31 - 1)] | None = Field(None, description="of all that is drawn at random")
     extractor: ExtractorName | None = Field(None, description="of keypoints; all but sift need a model on the workers")
