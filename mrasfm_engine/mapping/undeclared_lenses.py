@@ -30,9 +30,8 @@ from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.refinement_result import Refinement, solver_options, terms_of
 from mrasfm_engine.types import Bools, Cancel
 
-SHARE_OF_OBSERVATIONS = (
-    0.25  # of those that an adjustment takes of an image: what bends a whole way, these tell as well
-)
+# Of those that an adjustment takes of an image: what bends a whole way, these tell as well.
+SHARE_OF_OBSERVATIONS = 0.25
 
 
 def free_bending_lenses(mapper: Mapper, result: Refinement, free_units: Bools, *, cancel: Cancel | None) -> bool:
