@@ -203,7 +203,8 @@ def _calibration(
     sigma = sigma_given.copy()
     if scene.certainty_of_cameras is not None:
         sigma[:, :6] = scene.certainty_of_cameras[0]
-    observed = np.isfinite(scene.sigma_focal_px) & (config.refine_focal is not False)
+    may_vary = [config.intrinsics_may_vary(camera, is_single=len(cameras) == 1) for camera in cameras]
+    observed = np.isfinite(scene.sigma_focal_px) & may_vary
     sigma[observed, 6] = (scene.sigma_focal_px / manifest_focal_px)[observed]
     says = sigma < NOTHING_OBSERVED * sigma_given
     information = np.where(says, sigma**-2.0 - sigma_given**-2.0, 0.0)
