@@ -140,15 +140,15 @@ def _graph(
     component with this one's first scene.
     """
     by_name = {scene.name: scene for scene in found}
+    seen: dict[str, float] = {}  # the largest difference in length that seams of a scene show
+    for seam in seams:
+        for name in (seam.a, seam.b):
+            seen[name] = max(seen.get(name, 0.0), seam.off_in_length)
     graph, loops = SeamGraph(
         list(by_name),
         seams,
         paths=[
-            ScenePaths.from_scene(
-                scene,
-                most_scale=config.aggregation.max_scale_error,
-                seen=max((seam.off_in_length for seam in seams if scene.name in (seam.a, seam.b)), default=0.0),
-            )
+            ScenePaths.from_scene(scene, most_scale=config.aggregation.max_scale_error, seen=seen.get(scene.name, 0.0))
             for scene in found
         ],
         off_positions=lambda k: _off_positions(seams[k], by_name[seams[k].a], by_name[seams[k].b]),
