@@ -231,6 +231,17 @@ class Eliminated:
         """A^-1 B' (6 units, f + x): Z."""
         return self.factor.backward(self.half_coupled)
 
+    def equations_of_border(self, system: ReducedCameraSystem) -> tuple[Floats, Floats]:
+        """Matrix (f + x, f + x) and gradient (f + x,) of the border, which has unknowns, without the units.
+
+        Terms' own unknowns are where they cost least.
+        """
+        assert self.cameras is not None
+        factor, split = np.tril(self.cameras[0]), len(self.half_coupled)
+        gradient = -self.coupled.T @ system.gradient[:split]
+        gradient[: len(self.free)] += system.gradient[split + self.free]
+        return factor @ factor.T, gradient
+
     def units_of(self, right: Floats) -> Floats:
         """A^-1 (6 units,) of a right-hand side."""
         return self.factor.solve(right)

@@ -75,8 +75,7 @@ def scale_of_given_rotations(
     place = eliminated.free % problem.layout.camera_dof
     of_lens, of_rotation = np.isin(place, PLACES_OF_INTRINSICS), place < 3
     of_rest, of_rig = ~of_lens & ~of_rotation, ~of_lens
-    factor = np.tril(eliminated.cameras[0])
-    known = (factor @ factor.T)[: len(place), : len(place)]
+    known = eliminated.equations_of_border(system)[0][: len(place), : len(place)]
     known = known + RIDGE * np.diag(np.diagonal(known))
 
     def if_varied(chosen: Bools, others: Bools) -> Floats:

@@ -187,10 +187,7 @@ class _Lenses:
         if eliminated is None or eliminated.cameras is None:
             return None
         free, dof, split = eliminated.free, problem.layout.camera_dof, UNIT_DOF * problem.layout.num_units
-        factor = np.tril(eliminated.cameras[0])
-        known = factor @ factor.T
-        gradient = -eliminated.coupled.T @ system.gradient[:split]
-        gradient[: len(free)] += system.gradient[split + free]  # terms' own unknowns are where they cost least
+        known, gradient = eliminated.equations_of_border(system)
         camera, parameter = free // dof, np.searchsorted(PLACES_OF_INTRINSICS, free % dof)
         is_lens = np.isin(free % dof, PLACES_OF_INTRINSICS)
         lens, rest = np.flatnonzero(is_lens), np.setdiff1d(np.arange(len(known)), np.flatnonzero(is_lens))

@@ -91,9 +91,7 @@ def _bend_px(mapper: Mapper, problem: Problem) -> float:
     eliminated = system.eliminate((~(system.matrix_diagonal() > 0.0)).astype(np.float64))
     if eliminated is None or eliminated.cameras is None:
         return 0.0
-    split, border = UNIT_DOF * problem.layout.num_units, np.tril(eliminated.cameras[0])
-    known, gradient = border @ border.T, -eliminated.coupled.T @ system.gradient[:split]
-    gradient[: len(eliminated.free)] += system.gradient[split + eliminated.free]
+    known, gradient = eliminated.equations_of_border(system)
     is_lens = np.zeros(len(known), dtype=np.bool_)
     is_lens[: len(eliminated.free)] = np.isin(eliminated.free % problem.layout.camera_dof, PLACES_OF_INTRINSICS)
     step = np.asarray(-np.linalg.solve(known, gradient), dtype=np.float64)
