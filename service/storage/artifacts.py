@@ -261,7 +261,8 @@ class ArtifactStore:
             return
         if not self._is_new():
             raise StoreAwayError
-        self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if not self._root.exists():
+            self._root.mkdir(parents=True, exist_ok=True, mode=0o700)
         (self._root / _PREFIX).mkdir(exist_ok=True, mode=0o700)
 
     def _make_parents(self, target: Path) -> None:

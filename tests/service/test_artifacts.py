@@ -274,7 +274,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path) -> None:
     settings = settings_of(tmp_path / "data")
     settings.data_dir.mkdir()
     (settings.data_dir / "artifacts").write_bytes(b"a file in its place")
-    with pytest.raises(OSError, match=r"directory|exists"):
+    with pytest.raises(OSError, match="directory"):
         new_store(settings).require_writable()
 
 
