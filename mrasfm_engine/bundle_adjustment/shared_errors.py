@@ -42,6 +42,10 @@ MIN_UNITS = 4  # fewer tell no covariance
 SIGMAS = 3.0  # at which what few units tell is as improbable as of a normal distribution
 LEVELS = 10  # rounds, in which directions that stood out no longer do
 SINGULAR = 1e-9  # eigenvalues of a correlation below this are rounding
+# Share of the images in what is known of a direction, below which priors alone tell it: less may be rounding where
+# unknowns nearly make up for one another.
+UNTOLD = 1e-4
+LEAST_GAIN = 1e-6  # of a squared sigma, by a factor of e: where no factor gains it, rounding would choose one
 POINT_GROUPS = 4096  # points that share nothing add up to as much as one by one; so many tell a variance to 2 %
 
 
@@ -111,13 +115,16 @@ def _best_sigma_factor(covariance: Floats, of_independent: Floats, of_priors: Fl
     white = white @ axes
     scores = white.T @ found @ white - np.diag(of_terms)  # covariance of those of images
     share = np.clip(of_terms, 0.0, 1.0)  # above one where the loss bends the other way: images tell nothing there
+    untold = 1.0 - share < UNTOLD
+    share[untold], scores[untold], scores[:, untold] = 1.0, 0.0, 0.0
     told = (1.0 - share)[:, None] * np.linalg.pinv(scores, rcond=SINGULAR, hermitian=True) * (1.0 - share)
     metric = told + np.diag(share)
 
     def squared_errors(log_factor: float) -> float:
         weight = np.exp(-2.0 * log_factor)
         gain = 1.0 / (weight * (1.0 - share) + share)
-        return float((gain[:, None] * (weight**2 * scores + np.diag(share)) * gain * metric).sum())
+        errors = float((gain[:, None] * (weight**2 * scores + np.diag(share)) * gain * metric).sum())
+        return errors + LEAST_GAIN * log_factor**2
 
     most = 0.5 * np.log(max(float(np.linalg.eigvalsh(scores)[-1]), 1.0))
     best = minimize_scalar(squared_errors, bounds=(0.0, most), method="bounded") if most > 0.0 else None

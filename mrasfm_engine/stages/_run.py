@@ -37,7 +37,7 @@ Result = TypeVar("Result")
 # Raise a stage's version with every change after which the same input and settings give another result: what was
 # finished under an older version is done again, with all that follows from it.
 OWN_CAR_VERSION, EXTRACTION_SIZE_VERSION = 5, 4
-VERSIONS = {Stage.FEATURES: 11, Stage.MATCHES: 18, Stage.MAPPING: 26, Stage.REFINEMENT: 30}
+VERSIONS = {Stage.FEATURES: 11, Stage.MATCHES: 18, Stage.MAPPING: 26, Stage.REFINEMENT: 31}
 
 
 def new_report() -> dict[str, Any]:

@@ -57,6 +57,20 @@ def test_latitude_and_longitude_exchanged(kitti02: Path, variant_of: Callable[[P
 
 
 @pytest.mark.slow
+def test_any_number_of_threads_makes_the_same_scene(shared_data: Path, tmp_path: Path, mrasfm: Run) -> None:
+    """A straight street without GNSS tells its scale to a tenth: what rounding decides shows there."""
+    drive, positions_m = tmp_path / "drive", []
+    assert mrasfm("import", shared_data / "kitti06", "--out", drive).code == 0
+    for threads in (1, 2, 3):
+        settings, scene = tmp_path / f"{threads}.toml", tmp_path / f"scene {threads}"
+        settings.write_text(f"threads = {threads}\nuse_gnss = false\noutput = {{pictures = false}}\n")
+        assert mrasfm("reconstruct", drive, "--config", settings, "--out", scene).code == 0
+        units = json.loads((scene / "poses.json").read_text())["units"]
+        positions_m.append([unit["world_from_rig"]["translation_m"] for unit in units])
+    np.testing.assert_allclose(positions_m[1:], positions_m[:1] * 2, atol=1e-5)
+
+
+@pytest.mark.slow
 def test_cameras_that_share_no_view_stay_where_they_were_given(shared_data: Path, tmp_path: Path, mrasfm: Run) -> None:
     """Seven metres of way tell hardly where three cameras are that look apart; what traffic and interpolation leave in
     the images would move the one behind by six sigmas of its prior.

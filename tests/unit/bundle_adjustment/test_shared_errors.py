@@ -143,6 +143,17 @@ def test_information_that_the_loss_takes_from_priors_is_no_error_of_images() -> 
     assert 2.0 < shared_errors._best_sigma_factor(more, np.eye(2), of_priors) < 4.0
 
 
+def test_rounding_chooses_no_factor_where_none_changes_anything() -> None:
+    """Images alone tell one direction, priors alone the others, and one of these is nearly a sum of the rest."""
+    axes = np.linalg.qr(np.random.default_rng(0).normal(size=(4, 4)))[0] * np.sqrt([1.0, 1.0, 1.0, 1e-6])
+    independent, priors = axes @ axes.T, axes[:, 1:] @ axes[:, 1:].T
+    covariance = priors + 9.0 * np.outer(axes[:, 0], axes[:, 0])
+    for seed in range(10):
+        rounding = 1e-11 * np.random.default_rng(seed).normal(size=(2, 4, 4))
+        found, known = (m + r + r.T for m, r in zip((covariance, priors), rounding, strict=True))
+        assert shared_errors._best_sigma_factor(found, independent, known) == pytest.approx(1.0, abs=0.01)
+
+
 def drawn_prior(truth: State, seed: int) -> CalibrationPrior:
     """A prior that is off by what it states."""
     off = np.random.default_rng(100 + seed).normal(size=(CAMERAS, 6))
