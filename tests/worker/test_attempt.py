@@ -51,12 +51,15 @@ def attempt(
     )
 
 
-def attempt_with_a_signal(drive: Path, scratch: Path, settings: Settings, number: signal.Signals) -> Outcome:
-    """The child gets a signal as soon as it reports a stage."""
+def attempt_with_a_signal(
+    drive: Path, scratch: Path, settings: Settings, number: signal.Signals, *, steps: int = 0
+) -> Outcome:
+    """The child gets a signal as soon as it reports a stage; or so many steps of one, when its code is imported."""
     meter, sent = meter_of(), []
 
     def check_stop() -> None:
-        if meter.stage and not sent:
+        is_due = meter.at(0.0).done >= steps if steps else meter.stage
+        if is_due and not sent:
             sent.append(number)
             (child,) = children_of(os.getpid(), "worker.child")
             os.kill(child.pid, number)
@@ -222,7 +225,7 @@ def test_killed_child(brief_drive: Path, scratch: Path, settings: Settings) -> N
 
 @pytest.mark.slow
 def test_aborted_child(small_drive: Path, scratch: Path, settings: Settings) -> None:
-    outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGABRT)
+    outcome = attempt_with_a_signal(small_drive, scratch, settings, signal.SIGABRT, steps=2)
     assert isinstance(outcome, Failed)
     assert (outcome.code, outcome.retryable) == ("engine-abort", True)
     assert "SIGABRT" in outcome.what
