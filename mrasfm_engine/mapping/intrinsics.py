@@ -26,7 +26,7 @@ from mrasfm_engine.types import Bools, Cancel, Floats
 from schemas.drive import CAMERA_MODELS, Camera, Rig
 from schemas.findings import Finding, warning
 
-DISTORTION = slice(4, INTRINSICS)  # among the intrinsics
+FOCAL_FACTOR, DISTORTION = 0, slice(4, INTRINSICS)  # among the intrinsics
 BEYOND_PRIOR_SIGMAS = 4.0
 HELD_TERMS = ("k3", "k4", "k5", "k6")  # of FULL_OPENCV: no prior of them is known, and k1 and k2 look nearly like them
 SIGMA_ASPECT = 5e-4  # of fy over fx: pixels are square
@@ -133,6 +133,10 @@ def assess_intrinsics(
 ) -> IntrinsicsDecision:
     """Free the intrinsics that the models of cameras have where the drive observes the focal length.
 
+    A focal length that it does not observe is held: along a straight street it is the length of the way. The other
+    intrinsics of a camera that is declared uncertain vary under their priors all the same, and those of cameras whose
+    lenses bend the way.
+
     Pinhole cameras have a model with distortion from then on if they are free: what rectified images have left of it
     would else pass for a part of the focal length. Where `refine_focal` asks for all cameras, only a single one has it,
     and those whose intrinsics the manifest declares uncertain.
@@ -145,10 +149,19 @@ def assess_intrinsics(
         Of the adjustment that would follow, with the calibration's prior; that of the intrinsics is added.
     """
     given = mapper.drive.manifest.rig
-    by_default = mapper.config.bundle_adjustment.refine_focal is None or mapper.drive.has_single_camera
-    may_be_distorted = asked & np.array([by_default or camera.declares_intrinsics for camera in given.cameras])
+    is_single, by_default = mapper.drive.has_single_camera, mapper.config.bundle_adjustment.refine_focal is None
+    declared = np.array([camera.declares_intrinsics for camera in given.cameras])
+    may_be_distorted = asked & (declared | by_default | is_single)
     take_models(mapper, given, may_be_distorted)
-    decision = _decided(mapper, asked, free_units=free_units, terms=terms, options=options, cancel=cancel)
+    decision = _decided(
+        mapper,
+        asked,
+        asked & (declared | (by_default and not is_single)),
+        free_units=free_units,
+        terms=terms,
+        options=options,
+        cancel=cancel,
+    )
     take_models(mapper, given, may_be_distorted & decision.distortion_varies)
     return decision
 
@@ -156,13 +169,17 @@ def assess_intrinsics(
 def _decided(
     mapper: Mapper,
     asked: Bools,
+    others_vary: Bools,
     *,
     free_units: Bools,
     terms: Sequence[Term],
     options: SolverOptions,
     cancel: Cancel | None,
 ) -> IntrinsicsDecision:
-    """The decision about cameras whose models have all that may vary."""
+    """The decision about cameras whose models have all that may vary.
+
+    `others_vary` are those (cameras,) whose other intrinsics vary where their focal lengths are held as well.
+    """
     prior = intrinsics_prior(mapper)
     problem = problem_of_all_intrinsics(mapper, prior, asked, free_units=free_units, terms=terms, options=options)
     if problem.layout.size > MAX_UNKNOWNS_FOR_COVARIANCE:
@@ -172,8 +189,10 @@ def _decided(
     solution, _ = solve_with_chosen_points(problem, mapper.image_size_px, an_image=an_image, cancel=cancel)
     sigma = np.where(asked, covariances(problem, solution).sigma_camera[:, 6], np.nan)
     observed = sigma < OBSERVED_RATIO * prior.sigma[:, 0]
+    free = _of_models(mapper) & (observed | others_vary)[:, None]
+    free[:, FOCAL_FACTOR] = observed
     return IntrinsicsDecision(
-        free=_of_models(mapper) & observed[:, None],
+        free=free,
         asked=asked,
         sigma_focal=sigma,
         prior_sigma_focal=prior.sigma[:, 0],

@@ -18,7 +18,6 @@ from mrasfm_engine.bundle_adjustment.observation_sampling import choose_points
 from mrasfm_engine.bundle_adjustment.problem import PLACES_OF_INTRINSICS, UNIT_DOF
 from mrasfm_engine.bundle_adjustment.solver import Problem
 from mrasfm_engine.geometry.alignment import align_similarity
-from mrasfm_engine.mapping.calibration import has_few_units
 from mrasfm_engine.mapping.intrinsics import (
     BEYOND_PRIOR_SIGMAS,
     assess_intrinsics,
@@ -70,7 +69,6 @@ def _are_open(mapper: Mapper, result: Refinement) -> bool:
         and not result.intrinsics_are_asked
         and not mapper.drive.has_single_camera
         and mapper.state.simultaneous
-        and not has_few_units(mapper)
     )
 
 

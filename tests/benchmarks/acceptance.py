@@ -48,6 +48,7 @@ makes parts of it. The results of a line are kept with commit and date, see --ke
 | 41 | a drive of 3,600 images by the command: memory, and the time of a unit beside a quarter of it |
 | 42 | the same drive on two workers beside one, and while workers are killed |
 | 43 | real drives varied so that their geometry stays: cameras turned, mirrored, backwards, elsewhere, in other light |
+| 44 | real drives of which every second to tenth frame is there |
 
 What is timed runs alone, with all cores. What is not runs after it, a drive on each core.
 """
@@ -108,6 +109,7 @@ from tests.benchmarks.service import kills, maps_over_http, service
 from tests.benchmarks.sigmas import halves, simulated, with_wrong_lenses, without_positions
 from tests.benchmarks.simulated_routes import simulated_routes
 from tests.benchmarks.slow_tests import slow_tests_of_engine, slow_tests_of_service
+from tests.benchmarks.sparse_frames import sparse_frames
 from tests.benchmarks.speed import from_descriptors, long_routes, speed, surround_speed
 from tests.benchmarks.stops import stops
 from tests.benchmarks.submaps import loop_over_borders, submaps
@@ -180,6 +182,7 @@ LINES = {
     "41": Line(timed=(memory_of_long_drives,)),
     "42": Line(timed=(on_several_workers,)),
     "43": Line(untimed=(varied_surround, varied_pairs)),
+    "44": Line(untimed=(sparse_frames,)),
 }
 # Accuracy on real drives, speed of mapping, of the adjustment and of the whole command, and drives with gaps.
 HEADLINE = ("1", "2", "13", "28", "35")

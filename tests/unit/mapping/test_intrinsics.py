@@ -200,6 +200,20 @@ def test_distortion_that_is_left_in_images_of_pinhole_cameras(
     assert (np.abs(off) < 3 * certainty.sigma_camera[:, 6]).all()
 
 
+def test_distortion_is_found_beside_focal_lengths_that_are_held() -> None:
+    """Focal lengths that are known well the drive does not tell better; the rest of the lens it does."""
+    simulated = distorted(make_simulated_drive(units=20, cameras=2, points=1500), sigma_focal_px=0.1)
+    mapper = with_true_poses(make_model(simulated, config=EngineConfig(threads=1)), simulated, range(20))
+    given = mapper.state.camera_params.copy()
+    result = refine(mapper, AbsolutePriors(gnss=received(simulated, 0.05), antenna_in_rig_m=ARM_M))
+    assert result.intrinsics is not None
+    np.testing.assert_array_equal(result.intrinsics.free, np.tile(np.arange(8) > 0, (2, 1)))
+    np.testing.assert_array_equal(mapper.state.camera_params[:, 0], given[:, 0])
+    np.testing.assert_allclose(mapper.state.camera_params[:, 4], K1, atol=0.15 * K1)
+    assert result.certainty is not None
+    np.testing.assert_allclose(result.intrinsics.prior_sigma_focal * given[:, 0], 0.1)
+
+
 def test_a_smaller_component_has_the_lens_models_of_the_largest() -> None:
     simulated = distorted(make_simulated_drive(units=12, cameras=2, points=600))
     whole, part = (with_true_poses(make_model(simulated), simulated, units) for units in (range(8), range(8, 12)))
