@@ -219,9 +219,9 @@ def _focal_lengths(mapper: Mapper, refinement: Refinement) -> dict[str, Any]:
         "focal_lengths_px": {
             camera.name: {"given": camera.params[0], "refined": unpack_camera(camera.model, params)[0]}
             for camera, params, free in zip(
-                mapper.drive.cameras, mapper.state.camera_params, refinement.intrinsics.free.any(axis=1), strict=True
+                mapper.drive.cameras, mapper.state.camera_params, refinement.intrinsics.free, strict=True
             )
-            if free
+            if free.any()
         }
     }
 
