@@ -42,7 +42,7 @@ class IntrinsicsDecision:
     free
         (cameras, INTRINSICS)
     asked
-        (cameras,) whose intrinsics are free if the drive observes their focal lengths.
+        (cameras,) whose intrinsics might vary; their focal lengths do if the drive observes them.
     sigma_focal
         (cameras,) what the drive would know of these focal lengths, relative; NaN of the others.
     prior_sigma_focal

@@ -80,7 +80,7 @@ class Refinement:
 
     @property
     def intrinsics_are_asked(self) -> bool:
-        """True where any camera's intrinsics are free if the drive observes its focal length."""
+        """True where any camera's intrinsics might vary."""
         return self.intrinsics is not None and bool(self.intrinsics.asked.any())
 
     @property

@@ -3,7 +3,7 @@
 Lens models are off by tenths of a pixel, and cameras and units turn by as much to make up for it. On a way that turns,
 that adds up from unit to unit, and bends it. One Gauss-Newton step in which all intrinsics vary under their priors says
 by how much. Where it looks like more than lenses usually are off by, from as far away as units lie from their middle,
-the intrinsics vary if the drive observes the focal length, as those do that the manifest declares uncertain.
+the intrinsics vary as those do that the manifest declares uncertain.
 
 What a vehicle does between two units, which images of other times and rolling shutters show, is interpolated. In a turn
 the error of that looks like one of a lens: such drives keep their lenses.
