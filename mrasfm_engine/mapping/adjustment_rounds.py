@@ -70,7 +70,7 @@ def adjust_in_rounds(
 
 def hear_given_rotations(mapper: Mapper, result: Refinement, free_units: Bools) -> None:
     """Let the rotations as given have their say on the scale that images have found by themselves."""
-    if not result.calibration.free or result.georeferenced or not reassesses(mapper) or has_few_units(mapper):
+    if not result.calibration.free or result.georeferenced or not reassesses(mapper):
         return
     result.given_scale = scale_of_given_rotations(
         mapper,

@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from mrasfm_engine.bundle_adjustment.marginal_covariances import Covariances, covariances
 from mrasfm_engine.bundle_adjustment.observability_analysis import Observability, assess_directions
 from mrasfm_engine.bundle_adjustment.priors import CalibrationPrior, Term
+from mrasfm_engine.bundle_adjustment.shared_errors import MIN_UNITS
 from mrasfm_engine.bundle_adjustment.solver import SolverOptions
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.matching.simultaneous import calibration_sigmas
@@ -18,7 +19,7 @@ from mrasfm_engine.types import Bools, Floats
 
 STRAIGHT = "held as given: without GNSS a drive this straight does not observe it"
 FEW_UNITS = "held as given: too few units to tell what they err by together"
-MANY_UNITS = 10  # that correct a calibration without positions, and leave nothing open but what its prior knows
+MANY_UNITS = 10  # that leave nothing of a calibration open but what its prior knows
 MIN_BASELINES_M2 = 1e-6
 SCALE_RANGE = 0.3  # of its logarithm, that an adjustment may be off
 
@@ -118,6 +119,11 @@ def assess_calibration(
 def has_few_units(mapper: Mapper) -> bool:
     """True where fewer than MANY_UNITS are registered."""
     return bool(mapper.registered.sum() < MANY_UNITS)
+
+
+def units_tell_shared_errors(mapper: Mapper) -> bool:
+    """True where enough units are registered to tell errors that their observations share."""
+    return bool(mapper.registered.sum() >= MIN_UNITS)
 
 
 def is_straight(mapper: Mapper) -> bool:

@@ -11,7 +11,7 @@ from mrasfm_engine.mapping.adjustment_rounds import (
     reassesses,
     weigh_shared_errors,
 )
-from mrasfm_engine.mapping.calibration import CalibrationDecision
+from mrasfm_engine.mapping.calibration import CalibrationDecision, has_few_units
 from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
 from mrasfm_engine.mapping.mapper import Mapper
 from mrasfm_engine.mapping.other_sizes import (
@@ -72,12 +72,14 @@ def _is_of_another_size(mapper: Mapper, result: Refinement, scenes: SizedScenes)
     """True where a scene of another size is clearly more likely than the one that was found, and may take its place.
 
     A scene whose cameras have varied is at a minimum, whose certainty holds the sizes near it. What others cost, errors
-    that observations share may decide there.
+    that observations share may decide there. Of few units that certainty is no more than the curvature somewhere along
+    a flat tail.
     """
     assert result.certainty is not None
     if not (result.calibration.free or result.calibration.is_open) or not reassesses(mapper):
         return False
-    near = CLEAR_SIGMAS * result.certainty.sigma_scale if result.calibration.free else 0.0
+    is_at_minimum = result.calibration.free and not has_few_units(mapper)
+    near = CLEAR_SIGMAS * result.certainty.sigma_scale if is_at_minimum else 0.0
     if not is_another_size(scenes.size_m[scenes.likely], size_m(mapper), near=near):
         return False
     return scenes.costs[scenes.likely].is_clearly_below(cost_as_found(mapper, solver_options(mapper, result)))

@@ -15,11 +15,11 @@ from mrasfm_engine.mapping.calibration import (
     CalibrationDecision,
     assess_calibration,
     calibration_prior,
-    has_few_units,
     hold_baselines,
     observed_directions,
     scale_of_baselines,
     take_calibration,
+    units_tell_shared_errors,
 )
 from mrasfm_engine.mapping.inlier_gates import observation_sigma_px
 from mrasfm_engine.mapping.intrinsics import (
@@ -152,7 +152,12 @@ def _decide_what_varies(
             options=solver_options(mapper, result),
         )
     result.recalibrated = np.full(len(mapper.camera_kind), result.calibration.free)
-    if result.calibration.free and not result.georeferenced and reassesses(mapper) and has_few_units(mapper):
+    if (
+        result.calibration.free
+        and not result.georeferenced
+        and reassesses(mapper)
+        and not units_tell_shared_errors(mapper)
+    ):
         _hold_unless_wrong(mapper, free_units, result)
     result.times_vary = result.calibration.free and times_may_vary(mapper)
     if result.times_vary and result.absolute.positions is not None:
@@ -233,7 +238,7 @@ def _compare_rough_poses_with_rig(mapper: Mapper, result: Refinement) -> None:
 def _hold_unless_wrong(mapper: Mapper, free_units: Bools, result: Refinement) -> None:
     """Put cameras back to where they began, but for those that are far off.
 
-    So few units do not tell what they err by as a whole.
+    So few units do not tell what their observations err by together, and are far too certain of their cameras.
     """
     problem, _ = mapper.problem(
         free_units,

@@ -70,10 +70,10 @@ def relative_errors_deg(mapper: Mapper, simulated: SimulatedDrive) -> np.ndarray
 
 @pytest.mark.parametrize("straight", [False, True])
 def test_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
-    """Also on a straight street without positions, where the calibration as a whole is held."""
+    """Also on a straight street of few units without positions."""
     simulated = drive(turned(2), straight=straight, points=1500)
     mapper, result = refined(simulated)
-    assert result.calibration.free is not straight
+    assert result.recalibrated.all()
     assert [w.camera for w in result.miscalibrations] == [2]
     wrong = result.miscalibrations[0]
     assert 2.9 < wrong.rotation_deg < 3.1
@@ -81,9 +81,6 @@ def test_a_wrong_camera_is_named_and_recalibrated(straight: bool) -> None:
     errors = relative_errors_deg(mapper, simulated)
     assert 0 < errors[2] < 0.1
     assert errors.max() < 0.1
-    if straight:
-        np.testing.assert_array_equal(result.recalibrated, np.arange(6) == 2)
-        np.testing.assert_array_equal(mapper.state.camera_rotation[0], simulated.drive.rig_from_cam[0, :3, :3])
 
 
 def test_a_camera_far_from_where_it_is_declared_to_a_millimetre_is_named_and_moved() -> None:
@@ -105,10 +102,12 @@ def test_a_camera_far_from_where_it_is_declared_to_a_millimetre_is_named_and_mov
 
 @pytest.mark.parametrize("straight", [False, True])
 def test_a_usual_calibration_names_nobody(straight: bool) -> None:
-    """Cameras that are off by 0.3 deg under a prior of 2 deg are what recalibration is for, if units are many."""
-    _, result = refined(drive(turned(None, others_deg=0.3), straight=straight))
+    """Cameras that are off by 0.3 deg under a prior of 2 deg are what recalibration is for."""
+    simulated = drive(turned(None, others_deg=0.3), straight=straight)
+    mapper, result = refined(simulated)
     assert result.miscalibrations == []
-    assert result.recalibrated.all() != straight
+    assert result.recalibrated.all()
+    assert 0 < relative_errors_deg(mapper, simulated).max() < 0.2
 
 
 def test_a_finding_says_which_camera_and_by_how_much() -> None:

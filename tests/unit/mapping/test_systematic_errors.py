@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mrasfm_engine.config import EngineConfig
+from mrasfm_engine.config import BundleAdjustmentConfig, EngineConfig
 from mrasfm_engine.mapping.absolute_priors import AbsolutePriors
 from mrasfm_engine.mapping.components import map_drive
 from mrasfm_engine.mapping.mapper import Mapper
@@ -31,10 +31,11 @@ from tests.helpers.simulated_drive import (
 LENS_PX = 0.3
 
 
-def refined(drive: SimulatedDrive) -> tuple[Mapper, Refinement]:
+def refined(drive: SimulatedDrive, config: EngineConfig | None = None) -> tuple[Mapper, Refinement]:
+    config = EngineConfig() if config is None else config
     keypoints = Keypoints.from_features(drive.drive, drive.features, RowBands.from_drive(drive.drive, compensate=True))
     mapper = map_drive(
-        drive.drive, keypoints, true_matches(drive), None, EngineConfig(), absolute=AbsolutePriors()
+        drive.drive, keypoints, true_matches(drive), None, config, absolute=AbsolutePriors()
     )[0].mapper  # fmt: skip
     return mapper, refine(mapper)
 
@@ -98,16 +99,19 @@ def test_other_errors_that_all_images_share_widen_sigmas() -> None:
     assert (result.systematic.sigma_camera(repeatability) >= others).all()
 
 
+SLIGHT_TURN: dict[str, Any] = {"radius_m": 60.0}
+STRAIGHT: dict[str, Any] = {"straight": True}
+
+
 @pytest.mark.parametrize(
-    ("straight", "sigma_focal_px"), [(False, 0.05), pytest.param(True, 5.0, marks=pytest.mark.slow)]
+    ("shape", "sigma_focal"), [(SLIGHT_TURN, 5e-5), pytest.param(STRAIGHT, 5e-3, marks=pytest.mark.slow)]
 )
-def test_lenses_that_are_declared_uncertain_and_held_err_as_others(*, straight: bool, sigma_focal_px: float) -> None:
-    """Cameras take what is wrong with a lens that is held, however uncertain it is declared."""
-    shape: dict[str, Any] = {"straight": True} if straight else {"radius_m": 60.0}
+def test_lenses_that_might_vary_and_are_held_err_as_others(*, shape: dict[str, Any], sigma_focal: float) -> None:
+    """Cameras take what is wrong with a lens that is held, however uncertain it is."""
     exact = make_simulated_drive(units=16, cameras=2, points=2000, noise_px=0.5, **shape)
     drive = with_lens_errors(exact, LENS_PX)
-    declared = [camera.model_copy(update={"sigma_focal_px": sigma_focal_px}) for camera in drive.drive.cameras]
-    mapper, result = refined(with_cameras(drive, declared))
+    settings = BundleAdjustmentConfig(refine_focal=True, sigma_focal=sigma_focal)
+    mapper, result = refined(drive, EngineConfig(bundle_adjustment=settings))
     assert result.intrinsics_are_asked
     assert not result.intrinsics_vary
     assert result.certainty is not None
@@ -115,6 +119,30 @@ def test_lenses_that_are_declared_uncertain_and_held_err_as_others(*, straight: 
     off_rad, sigma = camera_errors(mapper, drive)[:, :3], result.certainty.sigma_camera[:, :6]
     assert rms(off_rad / sigma[:, :3]) > 2.0, "lens errors do not show in this drive"
     assert 0.4 < rms(off_rad / result.systematic.sigma_camera(sigma)[:, :3]) < 2.0
+    scene = build_scene(mapper, result, drive.features, [], PriorTrajectory(source="none", world_from_rig=None))
+    focal_px = [camera.params[0] for camera in drive.drive.cameras]
+    found = [camera.sigma_focal_px for camera in scene.calibration]
+    np.testing.assert_allclose(found, sigma_focal * np.array(focal_px))
+
+
+@pytest.mark.parametrize(
+    ("shape", "sigma_focal_px"), [(SLIGHT_TURN, 0.05), pytest.param(STRAIGHT, 5.0, marks=pytest.mark.slow)]
+)
+def test_lenses_of_which_only_the_focal_length_is_held_err_by_what_is_certain(
+    *, shape: dict[str, Any], sigma_focal_px: float
+) -> None:
+    """The rest varies, and the uncertainty of the adjustment has what it is off by."""
+    exact = make_simulated_drive(units=16, cameras=2, points=2000, noise_px=0.5, **shape)
+    drive = with_lens_errors(exact, LENS_PX, parameters=[2, 3, 4, 5, 6, 7])
+    declared = [camera.model_copy(update={"sigma_focal_px": sigma_focal_px}) for camera in drive.drive.cameras]
+    mapper, result = refined(with_cameras(drive, declared))
+    assert result.intrinsics is not None
+    assert not result.intrinsics.free[:, 0].any()
+    assert result.intrinsics.free[:, 2:4].all()
+    assert result.systematic is None
+    assert result.certainty is not None
+    off_rad = camera_errors(mapper, drive)[:, :3]
+    assert 0.3 < rms(off_rad / result.certainty.sigma_camera[:, :3]) < 2.0
     scene = build_scene(mapper, result, drive.features, [], PriorTrajectory(source="none", world_from_rig=None))
     assert [camera.sigma_focal_px for camera in scene.calibration] == pytest.approx([sigma_focal_px] * 2)
 
