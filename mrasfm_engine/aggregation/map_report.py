@@ -62,7 +62,6 @@ class MapResult:
     loops: Sequence[Loop]  # of seams that do not close
     chains: Sequence[Chain]  # of components; the first is the map's
     map_from_scene: Floats  # (scenes, 4, 4) before units varied on their own
-    chained: Floats  # the same, one scene after the other
     placements: Sequence[Placement]  # of components that seams connect
     joint_reports: Sequence[Report]
     assembly: Assembly

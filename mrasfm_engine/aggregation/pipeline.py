@@ -186,7 +186,7 @@ def _join_scenes(
 ) -> MapResult:
     started = time.perf_counter()
     run.begin(Stage.MULTI_SCENE_ADJUSTMENT)
-    poses, chained = known.map_from_scene.copy(), known.map_from_scene.copy()
+    poses = known.map_from_scene.copy()
     places = [ScenePlace.from_scene(scene) for scene in found]
     placements: list[Placement] = []
     reports = []
@@ -208,7 +208,6 @@ def _join_scenes(
         placement = placed(own, known.map_from_scene, places)
         placements.append(placement)
         poses[members] = placement.map_from_first @ joint.first_from_scene
-        chained[members] = placement.map_from_first @ np.stack([chain.first_from_scene[k] for k in members])
         reports.append(joint.report)
     run.ended(Stage.MULTI_SCENE_ADJUSTMENT, started, loops=sum(len(chain.closings) for chain in chains))
     vehicles = vehicles_of(found, run.config.bundle_adjustment)
@@ -221,7 +220,6 @@ def _join_scenes(
         loops=loops,
         chains=chains,
         map_from_scene=poses,
-        chained=chained,
         placements=placements,
         joint_reports=[r for r in reports if r is not None],
         assembly=Assembly(scenes=found),

@@ -31,7 +31,7 @@ from mrasfm_engine.types import CountProgress, Floats, Ints
 
 BATCH_UNITS = 4  # relocalised between two tests of their agreement
 ENOUGH_AGREEING = 4  # units, after which no more are looked for
-ROUNDS = ((0.012, 0.006), (0.005, 0.004))  # how far matches and merges may be off, shares of the focal length
+MATCH_ERRORS = (0.012, 0.005)  # how far matches of a round may be off, shares of the focal length
 SIGMAS_OF_LENGTH = 3.0  # by which lengths may differ beyond `aggregation.max_scale_error`
 MAX_SHIFT_M, MAX_TURN_DEG = 0.5, 1.0  # by which the fine assembly may correct the consensus
 LEAST_SIGMA_RAD, LEAST_SIGMA_M = np.radians(0.02), 0.01  # it averages over the bends of both scenes there
@@ -175,7 +175,7 @@ def _assemble(
     """Match, merge and adjust in turns, each time from the better transform."""
     a, b = assembly.scenes
     refined: RefinedSeam | None = None
-    for match_error, _ in ROUNDS:
+    for match_error in MATCH_ERRORS:
         pairs = guided_pairs(a, b, a_from_b, config.aggregation)
         if not len(pairs):
             return None

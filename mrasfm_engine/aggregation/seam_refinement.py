@@ -171,7 +171,7 @@ class RefinedSeam:
     """A seam after its adjustment."""
 
     a_from_b: Floats
-    covariance: Floats  # (6, 6) of b's step [omega, v] about the shared units' place
+    covariance: Floats  # (6, 6) of b's step [omega (rad), v (m)] about the mean position of all of b's units
     shared: Shared
     errors_px: Floats  # (n,) of the observations of shared points
     report: Report

@@ -70,11 +70,12 @@ def motion_jump_findings(mapper: Mapper) -> list[Finding]:
         return []
     largest = int(np.argmax(jumps.distance_m))
     after, off_m = int(jumps.unit[largest]), float(jumps.distance_m[largest])
+    frames = [mapper.drive.manifest.frames[unit].source_frame for unit in units[after - 1 : after + 1].tolist()]
     more = f", and at {len(jumps.unit) - 1} more places" if len(jumps.unit) > 1 else ""
     return [
         error(
             "impossible-motion",
-            f"in the scene the vehicle moves as none does: between frames {units[after - 1]} and {units[after]} "
+            f"in the scene the vehicle moves as none does: between frames {frames[0]} and {frames[1]} "
             f"it jumps {off_m:.1f} m off its motion{more}. Places that look alike, as of facades that repeat, "
             "were taken for one, or timestamps are wrong",
             "Look at the trajectory in report.html and check frames' timestamps there. Rough poses or GNSS positions "

@@ -64,7 +64,7 @@ def most_likely_correction(
         damped = information + np.diag(prior + damping * np.diag(information))
         step = -np.linalg.solve(damped, gradient + prior * x)
         there = errors(x + step)
-        if _cost(there, x + step, spread, prior) > _cost(here, x, spread, prior):
+        if not _cost(there, x + step, spread, prior) <= _cost(here, x, spread, prior):  # a NaN is no step either
             damping *= 10.0
             continue
         x, here, damping = x + step, there, 0.1 * damping

@@ -173,7 +173,7 @@ def _correct(
         _turn(base_from_b, correction[3:6], moved_b)
         moved_a[:3, 3] = base_from_a[:3, 3] + correction[6:]
         _linearise(moved_a, moved_b, rays_a, rays_b, error, derivatives, normal)
-        if _cost(error, moved, spread) > cost:
+        if not _cost(error, moved, spread) <= cost:  # a NaN is no step either
             damping *= 10.0
             continue
         x[:] = moved

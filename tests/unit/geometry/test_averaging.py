@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,20 @@ def test_wrong_rotations_do_not_move_the_robust_mean(seed: int) -> None:
     assert 1e-4 < float(se3.rotation_angle_deg(mean @ centre.T)) < 0.35
     # The plain mean is what the robust one must not be.
     assert float(se3.rotation_angle_deg(se3.mean_rotation(np.concatenate([bad, good])) @ centre.T)) > 5
+
+
+def test_the_mean_of_a_long_drive_starts_from_few_rotations() -> None:
+    rng = np.random.default_rng(0)
+    good = se3.exp_so3(rng.normal(size=(6000, 3)) * np.radians(0.2))
+    bad = se3.exp_so3(rng.normal(size=(4000, 3)))
+    rotations = np.concatenate([bad, good])
+    for order in (rotations, rotations[rng.permutation(10_000)]):
+        tracemalloc.start()
+        mean = robust_mean_rotation(order)
+        peak_bytes = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert 0 < float(se3.rotation_angle_deg(mean)) < 0.5
+        assert peak_bytes < 1e9
 
 
 def test_one_wrong_camera_of_three_is_outvoted() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,6 +60,8 @@ def test_a_scene_that_jumps_is_an_error_that_names_the_frames() -> None:
     assert motion_jump_findings(mapper) == []
     units = np.flatnonzero(mapper.registered)
     mapper.state.unit_position_m[units[len(units) // 2 :]] -= [PERIOD_M, 0.0, 0.0]
+    frames = [f.model_copy(update={"source_frame": 100 + f.source_frame}) for f in mapper.drive.manifest.frames]
+    mapper.drive = replace(mapper.drive, manifest=mapper.drive.manifest.model_copy(update={"frames": frames}))
     (said,) = motion_jump_findings(mapper)
     assert (said.code, said.severity) == ("impossible-motion", "error")
-    assert f"between frames {units[len(units) // 2 - 1]} and {units[len(units) // 2]}" in said.what
+    assert f"between frames {100 + units[len(units) // 2 - 1]} and {100 + units[len(units) // 2]}" in said.what
