@@ -32,13 +32,17 @@ def _add(parser: argparse.ArgumentParser, *, data: str | None, json: str | bool)
     parser.add_argument("--json", action="store_true", default=json, help="print JSON")
 
 
-def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool = False) -> int:
+def administer(
+    action: Action, arguments: argparse.Namespace, *, may_begin: bool = False, only_reads: bool = False
+) -> int:
     """Run an action in one transaction on the service's records; its exit code.
 
     Parameters
     ----------
     may_begin
         Whether the action makes sense before the service has started for the first time.
+    only_reads
+        Whether the action changes nothing, so that it takes no turn of the service's writers.
     """
     from service.database.startup_errors import UnusableDatabaseError, unusable_is_told
     from service.storage.data_folder import DataFolderError, require_data_folder
@@ -55,7 +59,7 @@ def administer(action: Action, arguments: argparse.Namespace, *, may_begin: bool
         if settings.database_url is None:
             require_data_folder(settings.data_dir)
         with unusable_is_told(settings):
-            return _in_transaction(action, settings, arguments)
+            return _in_transaction(action, settings, arguments, may_begin=may_begin, only_reads=only_reads)
     except (UnusableDatabaseError, DataFolderError) as error:
         print(f"mrasfm: error: {error}", file=sys.stderr)
         return EXIT_CANNOT_RUN
@@ -71,13 +75,19 @@ def holds_state(settings: Settings) -> bool:
     return settings.database_url is not None or settings.database_file.exists()
 
 
-def _in_transaction(action: Action, settings: Settings, arguments: argparse.Namespace) -> int:
-    from service.database.connections import Database, migrate
+def _in_transaction(
+    action: Action, settings: Settings, arguments: argparse.Namespace, *, may_begin: bool, only_reads: bool
+) -> int:
+    from service.database.connections import Database, has_schema, migrate
+    from service.database.startup_errors import require_current
 
-    migrate(settings)
     database = Database.from_settings(settings)
     try:
-        with database.write() as session:
+        if may_begin and not has_schema(database):
+            migrate(settings)
+        # No other schema is changed here: processes of an older version may be at work on it.
+        require_current(database, settings)
+        with database.read() if only_reads else database.write() as session:
             return action(session, settings, arguments)
     finally:
         database.close()

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Do what is asked; a key is printed once and not kept."""
     if arguments.action == "create":
         return _create_and_say_where(arguments)
-    return administer(_ACTIONS[arguments.action], arguments)
+    return administer(_ACTIONS[arguments.action], arguments, only_reads=arguments.action == "list")
 
 
 def _create_and_say_where(arguments: argparse.Namespace) -> int:

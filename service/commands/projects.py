@@ -40,7 +40,7 @@ def register(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) ->
 
 def run(arguments: argparse.Namespace) -> int:
     """Do what is asked. A running service goes by it from its next request on."""
-    return administer(_ACTIONS[arguments.action], arguments)
+    return administer(_ACTIONS[arguments.action], arguments, only_reads=arguments.action == "list")
 
 
 def _list(session: Session, settings: Settings, arguments: argparse.Namespace) -> int:

@@ -239,12 +239,21 @@ def newest_schema() -> str:
 
 
 def is_current(database: Database) -> bool:
-    """Return whether the schema is the one that this code expects.
+    """Return whether the schema is the one that this code expects."""
+    return found_schema(database) == newest_schema()
+
+
+def has_schema(database: Database) -> bool:
+    """Return whether the database was migrated before, to whichever revision."""
+    return found_schema(database) is not None
+
+
+def found_schema(database: Database) -> str | None:
+    """The revision that the database has; None where it was never migrated.
 
     Asked without Alembic, which takes 10 MB that a process that does not migrate can do without.
     """
     with database.engine.connect() as connection:
         if not inspect(connection).has_table("alembic_version"):
-            return False
-        found = connection.scalars(text("SELECT version_num FROM alembic_version")).all()
-    return found == [newest_schema()]
+            return None
+        return connection.scalars(text("SELECT version_num FROM alembic_version")).one_or_none() or ""

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import time
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from service.commands import keys, projects
+from service.database.connections import Database, found_schema, migrate
+from service.settings import Settings
 from tests.helpers.live_api import Api, problem_of
 from tests.helpers.tiny_drive import tiny_drive
 
@@ -105,3 +109,70 @@ def test_options_may_come_after_the_action(tmp_path: Path, capsys: pytest.Captur
     assert [key["name"] for key in json.loads(capsys.readouterr().out)] == ["unnamed"]
     assert mrasfm("projects", "--data", folder, "list", "--json") == 0
     assert [project["name"] for project in json.loads(capsys.readouterr().out)] == ["default"]
+
+
+ACTIONS = [("keys", "list"), ("keys", "create"), ("projects", "list"), ("projects", "set", "a", "--max-drives", "2")]
+
+
+def _set_schema(settings: Settings, revision: str) -> None:
+    database = Database.from_settings(settings)
+    with database.write() as session:
+        session.execute(text("UPDATE alembic_version SET version_num = :revision"), {"revision": revision})
+    database.close()
+
+
+def _schema(settings: Settings) -> str | None:
+    database = Database.from_settings(settings)
+    try:
+        return found_schema(database)
+    finally:
+        database.close()
+
+
+@pytest.mark.parametrize("asked", ACTIONS)
+def test_a_database_that_older_processes_use_is_refused_and_left_as_it_is(
+    database_settings: Settings, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, asked: list[str]
+) -> None:
+    given = _environment(database_settings, monkeypatch)
+    migrate(database_settings)
+    _set_schema(database_settings, "0013")
+    assert mrasfm(*asked, *given) == 2
+    told = capsys.readouterr().err
+    assert "is of an older MRASfM" in told
+    assert ("run mrasfm migrate" if not given else "mrasfm standalone migrates") in told
+    assert _schema(database_settings) == "0013"
+    _set_schema(database_settings, "9999")
+    assert mrasfm(*asked, *given) == 2
+    assert "is of a newer MRASfM" in capsys.readouterr().err
+
+
+def test_an_empty_database_gets_its_schema_with_the_first_key_alone(
+    postgres_database: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = Settings(database_url=postgres_database)
+    _environment(settings, monkeypatch)
+    assert mrasfm("keys", "list") == 2
+    assert "has no records of a service. Run mrasfm migrate" in capsys.readouterr().err
+    assert _schema(settings) is None
+    assert mrasfm("keys", "create") == 0
+    assert mrasfm("keys", "list") == 0
+
+
+@pytest.mark.parametrize("asked", [("keys", "list"), ("projects", "list")])
+def test_lists_do_not_wait_for_who_writes(tmp_path: Path, asked: tuple[str, str]) -> None:
+    settings = Settings(data_dir=tmp_path / "state", database_url=None)
+    migrate(settings)
+    database = Database.from_settings(settings)
+    with database.write():
+        begun_s = time.monotonic()
+        assert mrasfm(*asked, "--data", str(settings.data_dir)) == 0
+        assert time.monotonic() - begun_s < 10.0, "a writer waits for 30 s"
+    database.close()
+
+
+def _environment(settings: Settings, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Arguments of commands for this database; those of a server's come with the environment."""
+    if settings.database_url is None:
+        return ["--data", str(settings.data_dir)]
+    monkeypatch.setenv("MRASFM_DATABASE_URL", settings.resolved_database_url)
+    return []
