@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, delete, false, or_, select, update
+from sqlalchemy import ColumnElement, delete, false, func, or_, select, tuple_, update
 from sqlalchemy.orm import Session
 
 from schemas.api.maps import MapSummary
@@ -18,6 +18,8 @@ from service.errors import MapBusy, UsedByJob, UsedByMap, VersionCurrent, not_fo
 from service.storage import blobs, named_blobs
 from service.storage.blob_writer import StoredFile
 from service.storage.named_blobs import Named
+
+VersionKey = tuple[str, int]  # the map's id and the version's number
 
 
 def get(session: Session, project_id: str, map_id: str, *, lock: bool = False) -> Map:
@@ -56,9 +58,39 @@ def scenes_of(session: Session, found: Map) -> list[MapScene]:
     return list(session.scalars(select(MapScene).where(mine).order_by(MapScene.name)))
 
 
-def job_under_way(session: Session, map_id: str) -> str | None:
-    """The aggregation that makes a map's next version, if there is one."""
-    return session.scalar(select(Job.id).where(Job.map_id == map_id, Job.state.not_in(TERMINAL)).limit(1))
+def children_of(session: Session, keys: Collection[VersionKey]) -> dict[VersionKey, int]:
+    """Number of the scenes and failed drives of versions; one that has none may be left out."""
+    scenes = select(MapScene.map_id, MapScene.number, func.count()).group_by(MapScene.map_id, MapScene.number)
+    failed = select(MapVersion.map_id, MapVersion.number, func.json_array_length(MapVersion.failed))
+    counts: dict[VersionKey, int] = {}
+    for statement in (scenes.where(_is_of(MapScene, keys)), failed.where(_is_of(MapVersion, keys))):
+        for map_id, number, count in session.execute(statement):
+            counts[map_id, number] = counts.get((map_id, number), 0) + count
+    return counts
+
+
+def versions_of(session: Session, keys: Collection[VersionKey]) -> dict[VersionKey, MapVersion]:
+    """Versions that are there, each whole."""
+    found = session.scalars(select(MapVersion).where(_is_of(MapVersion, keys)))
+    return {(version.map_id, version.number): version for version in found}
+
+
+def scenes_of_versions(session: Session, keys: Collection[VersionKey]) -> dict[VersionKey, list[MapScene]]:
+    """Scenes of versions, by name; a version that has none is left out."""
+    found: dict[VersionKey, list[MapScene]] = {}
+    for scene in session.scalars(select(MapScene).where(_is_of(MapScene, keys)).order_by(MapScene.name)):
+        found.setdefault((scene.map_id, scene.number), []).append(scene)
+    return found
+
+
+def _is_of(table: type[MapScene] | type[MapVersion], keys: Collection[VersionKey]) -> ColumnElement[bool]:
+    return tuple_(table.map_id, table.number).in_(keys)
+
+
+def jobs_under_way(session: Session, map_ids: Collection[str]) -> dict[str, str]:
+    """The aggregations that make the next versions of maps, by map; one without is left out."""
+    found = session.execute(select(Job.map_id, Job.id).where(Job.map_id.in_(map_ids), Job.state.not_in(TERMINAL)))
+    return {str(map_id): job_id for map_id, job_id in found}
 
 
 def require_idle(session: Session, found: Map) -> None:
@@ -69,7 +101,7 @@ def require_idle(session: Session, found: Map) -> None:
     ServiceError
         409.
     """
-    job_id = job_under_way(session, found.id)
+    job_id = jobs_under_way(session, [found.id]).get(found.id)
     if job_id is not None:
         raise MapBusy(
             f"job {job_id} is making the next version of map {found.id}",

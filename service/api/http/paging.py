@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from itertools import accumulate
 from typing import Any, TypeVar
 
 from sqlalchemy import ColumnElement, Row, Select, select, tuple_
@@ -91,6 +92,18 @@ def newest(
 def newest_after(row: Drive | Export | Job | Map | Scene | Webhook) -> str:
     """The cursor of the page of `newest` that goes on after a row."""
     return cursor_of(row.created_us, row.id)
+
+
+def count_together(children: Iterable[int], most: int) -> int:
+    """Number of the first items that have no more than so many children together; one at least, if there is one.
+
+    Parameters
+    ----------
+    children
+        Number of the children of each item, in the items' order.
+    """
+    until = list(accumulate(children))
+    return max(sum(count <= most for count in until), min(1, len(until)))
 
 
 def cursor_of(*position: Any) -> str:

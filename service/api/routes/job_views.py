@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Collection, Sequence
-from itertools import accumulate
 
 from sqlalchemy import ColumnElement, func, select
 from sqlalchemy.orm import Session
@@ -16,7 +15,7 @@ from schemas.api.jobs import JobState as ShownState
 from schemas.api.jobs import JobSubmap as SubmapResource
 from schemas.api.resource import Page
 from service.api.dependencies import moment
-from service.api.http.paging import newest, newest_after
+from service.api.http.paging import count_together, newest, newest_after
 from service.database.connections import clock_us
 from service.database.tables import Job, JobAttempt, JobMember, JobState
 from service.domain import jobs
@@ -120,8 +119,7 @@ def page_of_jobs(
 def count_shown_together(session: Session, job_ids: Sequence[str]) -> int:
     """Number of the first of these jobs whose children together are not too many; one at least, if there is one."""
     children = jobs.children_of(session, job_ids)
-    until = accumulate(children.get(job_id, 0) for job_id in job_ids)
-    return max(sum(count <= CHILDREN_OF_PAGE for count in until), min(1, len(job_ids)))
+    return count_together((children.get(job_id, 0) for job_id in job_ids), CHILDREN_OF_PAGE)
 
 
 def view_of(session: Session, job: Job, settings: Settings) -> JobResource:
