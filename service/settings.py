@@ -183,7 +183,9 @@ class Settings(BaseSettings):
         3, description="attempts that count against a job: the first and two retries"
     )
     max_losses: Annotated[int, Field(ge=1, le=10_000)] = Field(
-        20, description="lost workers and kills without a finished stage in between, after which a job ends"
+        20,
+        description="lost workers, kills and losses of the database without a finished stage in between, after which "
+        "a job ends",
     )
     retry_delay_seconds: Seconds = Field(2.0, description="delay before the first retry")
     storage_retry_growth: Annotated[float, Field(ge=1, le=1000)] = Field(

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from service.database.connections import Database
+from service.database.connections import Database, Transactions
 from service.domain import checkpoints, jobs
 from service.domain.checkpoints import Shelf
 from service.storage.artifacts import ArtifactStore, Fetch
@@ -61,9 +61,11 @@ class CheckpointKeeper:
             target=contextvars.copy_context().run, args=(self._run,), name="checkpoints", daemon=True
         )
 
-    def restore(self, fetch: Fetch, is_wanted: Callable[[str], bool] = lambda name: True) -> None:
+    def restore(
+        self, records: Transactions, fetch: Fetch, is_wanted: Callable[[str], bool] = lambda name: True
+    ) -> None:
         """Bring what earlier attempts and jobs have finished into the folder, where the name of its file is wanted."""
-        for name in checkpoints.restore(self._database, self._shelf, self._folder, fetch=fetch, is_wanted=is_wanted):
+        for name in checkpoints.restore(records, self._shelf, self._folder, fetch=fetch, is_wanted=is_wanted):
             self._kept[name] = _identity(self._folder / name)
 
     def keep_all(self) -> None:

@@ -41,6 +41,7 @@ from worker.job_handlers import ReconstructionHandler, handler_of
 from worker.oom import MemoryKills, kills_since, memory_kills
 from worker.outcomes import Failed, Outcome, Planned, Succeeded, failed_here
 from worker.progress import ProgressMeter
+from worker.retried_database import RetriedDatabase
 from worker.retry import RETRY_BUDGET_S, retry, watched
 from worker.termination import StopReason, StopRequest
 
@@ -51,6 +52,7 @@ _TITLES = {
     "engine-killed": "The engine was killed",
     "engine-abort": "The engine ended unexpectedly",
     "timeout": "The attempt took too long",
+    "database": "The database did not answer",
     "storage": "The worker's files or the artifact store failed",
     "worker-error": "The worker failed",
 }
@@ -151,12 +153,13 @@ class _Execution:
         self._artifacts = artifacts
         self._held = held
         self._shutting_down = shutting_down
-        self._handler = handler_of(database, held, settings)
         self._meter = meter = ProgressMeter(Work(held.kind.lower()), started_s=time.monotonic())
         self._heartbeat = Heartbeat(
             database, held, settings, progress=lambda: meter.at(time.monotonic()), shutting_down=shutting_down
         )
         self._check_stop = self._heartbeat.check_stop
+        self._records = RetriedDatabase(database, budget_s=RETRY_BUDGET_S, check_stop=self._check_stop)
+        self._handler = handler_of(self._records, held, settings)
 
     def run(self, *, prepare: Callable[[], None]) -> None:
         """Attempt the job, and record what came of it.
@@ -173,8 +176,8 @@ class _Execution:
             ):
                 folder = AttemptFolder(root)
                 _note_memory_kills(folder)
-                prepare()
                 try:
+                    retry(prepare, budget_s=RETRY_BUDGET_S, check_stop=self._check_stop)
                     self._record(self._attempt(folder))
                 except StopRequest as stop:
                     self._give_up(stop.reason)
@@ -252,7 +255,7 @@ class _Execution:
             folder=folder.finished_stages,
             spare=folder.root / "checkpoints",
         )
-        watched(lambda: keeper.restore(self._fetch, self._handler.is_wanted), self._check_stop)
+        watched(lambda: keeper.restore(self._records, self._fetch, self._handler.is_wanted), self._check_stop)
         return keeper
 
     def _fetch(self, key: str, target: Path) -> None:

@@ -17,12 +17,13 @@ from schemas.api.jobs import JobKind
 from schemas.api.maps import MapSummary
 from schemas.api.scenes import SceneSummary
 from schemas.artifacts import PLAN_CHECKPOINTS, SUBMAP_STAGES, checkpoint_file, submap_checkpoint, submap_number
-from service.database.connections import Database
+from service.database.connections import Transactions
 from service.database.tables import now_us
 from service.domain import checkpoints, exports, jobs, maps, scenes, workers
 from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.domain.drive_checkout import check_out
-from service.domain.map_inputs import MapInputs, inputs_of
+from service.domain.export_inputs import ExportInputs
+from service.domain.map_inputs import MapInputs, StoredArtifact, inputs_of
 from service.job_queue import QUEUES
 from service.settings import Settings
 from service.storage.artifacts import Fetch
@@ -40,8 +41,8 @@ class PreflightHandler:
     shelf: Shelf | None = None  # it shares no stages
     files: OnDemandFolder | None = None  # of a drive, where not all that are needed were laid out
 
-    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
-        self._database, self._held, self._settings = database, held, settings
+    def __init__(self, records: Transactions, held: jobs.Claim, settings: Settings) -> None:
+        self._records, self._held, self._settings = records, held, settings
         self._drive_id = held.drive_id or ""
 
     def is_wanted(self, name: str) -> bool:
@@ -66,7 +67,7 @@ class PreflightHandler:
         *,
         units: range | None = None,
     ) -> Attempt:
-        drive = check_out(self._database, self._drive_id, folder.root / "drive", fetch=fetch, units=units)
+        drive = check_out(self._records, self._drive_id, folder.root / "drive", fetch=fetch, units=units)
         room_bytes = self._settings.drive_room_bytes
         # In a folder the files exist once, however many drives are laid out.
         if drive.size_bytes <= room_bytes or self._settings.stores_in_folder:
@@ -92,8 +93,8 @@ class PreflightHandler:
 class _StagesHandler(PreflightHandler):
     """A job whose finished stages lie on the shelf of its drive under its settings."""
 
-    def __init__(self, database: Database, held: jobs.Claim, settings: Settings) -> None:
-        super().__init__(database, held, settings)
+    def __init__(self, records: Transactions, held: jobs.Claim, settings: Settings) -> None:
+        super().__init__(records, held, settings)
         self._stages = DriveShelf(self._drive_id, settings_sha256(held.settings))
         self.shelf = self._stages
 
@@ -123,8 +124,7 @@ class ReconstructionHandler(_StagesHandler):
             return 0
         if self._settings.submap_workers is not None:
             return self._settings.submap_workers
-        with self._database.read() as session:
-            return workers.count_processes(session, QUEUES[JobKind.SUBMAP])
+        return self._records.query(lambda session: workers.count_processes(session, QUEUES[JobKind.SUBMAP]))
 
     def wait_for_submaps(self, session: Session, plan: SubmapPlan) -> list[str]:
         """Record jobs for the sub-maps and give the reconstruction back until they have ended; ids of the jobs."""
@@ -182,8 +182,8 @@ class AggregationHandler:
 
     files: OnDemandFolder | None = None
 
-    def __init__(self, database: Database, held: jobs.Claim) -> None:
-        self._database, self._held = database, held
+    def __init__(self, records: Transactions, held: jobs.Claim) -> None:
+        self._records, self._held = records, held
 
     def is_wanted(self, name: str) -> bool:
         """Return whether a finished stage is brought, likewise."""
@@ -192,8 +192,7 @@ class AggregationHandler:
     @cached_property
     def _inputs(self) -> MapInputs:
         """Read where they are needed: what publishes must not fail for a database that is away for a moment."""
-        with self._database.read() as session:
-            return inputs_of(session, self._held.job_id)
+        return self._records.query(lambda session: inputs_of(session, self._held.job_id))
 
     @property
     def shelf(self) -> Shelf | None:
@@ -247,8 +246,8 @@ class ExportHandler:
     shelf: Shelf | None = None  # it shares no stages
     files: OnDemandFolder | None = None
 
-    def __init__(self, database: Database, held: jobs.Claim) -> None:
-        self._database, self._held = database, held
+    def __init__(self, records: Transactions, held: jobs.Claim) -> None:
+        self._records, self._held = records, held
 
     def is_wanted(self, name: str) -> bool:
         """Return whether a finished stage is brought, likewise."""
@@ -262,9 +261,7 @@ class ExportHandler:
         DriveGoneError, ExportGoneError
             Where a drive or the export was deleted.
         """
-        with self._database.read() as session:
-            inputs = exports.inputs_of(session, self._held)
-            files, drives = inputs.files(session), inputs.drives(session)
+        inputs, files, drives = self._records.query(self._found)
         source = folder.root / "source"
         total = len(files) + len(drives)  # a drive counts as one until its files are known
         wanted = [(file.key, source / file.path) for file in files]
@@ -273,7 +270,7 @@ class ExportHandler:
         for drive_id in sorted(set(drives.values())):
             folders[drive_id] = folder.root / "drives" / drive_id
             # All of it: most of these images are part of the export, which lies on this disk too.
-            check_out(self._database, drive_id, folders[drive_id], fetch=fetch).bring_all(fetch, progress)
+            check_out(self._records, drive_id, folders[drive_id], fetch=fetch).bring_all(fetch, progress)
         return Attempt(
             work=Work.EXPORT,
             settings=self._held.settings,
@@ -282,6 +279,11 @@ class ExportHandler:
             formats=inputs.formats,
             options=inputs.engine_options,
         )
+
+    def _found(self, session: Session) -> tuple[ExportInputs, list[StoredArtifact], dict[str, str]]:
+        """The inputs of the export, its files, and its drives by the names of scenes."""
+        inputs = exports.inputs_of(session, self._held)
+        return inputs, inputs.files(session), inputs.drives(session)
 
     def publish(
         self, session: Session, done: Succeeded, files: Mapping[str, StoredFile], settings: Settings
@@ -300,19 +302,19 @@ class ExportHandler:
 JobHandler = PreflightHandler | ReconstructionHandler | SubmapHandler | AggregationHandler | ExportHandler
 
 
-def handler_of(database: Database, held: jobs.Claim, settings: Settings) -> JobHandler:
+def handler_of(records: Transactions, held: jobs.Claim, settings: Settings) -> JobHandler:
     """The handler for a job's kind."""
     match held.kind:
         case JobKind.AGGREGATION:
-            return AggregationHandler(database, held)
+            return AggregationHandler(records, held)
         case JobKind.RECONSTRUCTION:
-            return ReconstructionHandler(database, held, settings)
+            return ReconstructionHandler(records, held, settings)
         case JobKind.SUBMAP:
-            return SubmapHandler(database, held, settings)
+            return SubmapHandler(records, held, settings)
         case JobKind.EXPORT:
-            return ExportHandler(database, held)
+            return ExportHandler(records, held)
         case _:
-            return PreflightHandler(database, held, settings)
+            return PreflightHandler(records, held, settings)
 
 
 def _expires_us(days: float | None) -> int | None:

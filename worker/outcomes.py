@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from obstore.exceptions import BaseError as StoreError
+from sqlalchemy.exc import SQLAlchemyError
 
 from service.domain import jobs
 from worker.child import EXIT_DONE, EXIT_OUT_OF_MEMORY
 from worker.child_protocol import ChildError, ChildResult, SubmapPlan
+from worker.retry import may_pass
 
 _KILLED = (
     "Retry the job: finished stages are reused. If it happens again in one stage, a program that watches memory may "
@@ -53,7 +55,8 @@ class Failed(ChildError):
     Attributes
     ----------
     code
-        The engine's own, or out-of-memory, engine-killed, engine-abort, timeout, storage, worker-error, drive-deleted.
+        The engine's own, or out-of-memory, engine-killed, engine-abort, timeout, database, storage, worker-error,
+        drive-deleted, export-deleted.
     is_storage
         Whether a store or a disk failed: each further attempt waits longer for it.
     stage
@@ -152,6 +155,15 @@ def _how(returncode: int) -> str:
 
 def failed_here(error: Exception, stage: str) -> Failed:
     """The worker's own failure, without paths and addresses, which are the operator's and stand in the log."""
+    if isinstance(error, SQLAlchemyError) and may_pass(error):
+        return Failed(
+            code="database",
+            what="the service's database did not answer",
+            remedy="Retry the job later; if it fails again, the operator finds the reason in the worker's log.",
+            retryable=True,
+            stage=stage,
+            blame=jobs.NO_BLAME,
+        )
     if not isinstance(error, OSError | StoreError):
         return Failed(
             code="worker-error",

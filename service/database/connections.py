@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from sqlalchemy import Engine, ExceptionContext, create_engine, event, inspect, text
 from sqlalchemy.engine import make_url
@@ -37,6 +37,19 @@ PAUSE_S = 10.0  # of a migration that got no table
 MAX_MIGRATION_ATTEMPTS = 40
 # An error tells its statement, and not what was given to it: that is the users', and may be a hundred thousand names.
 _ENGINE: dict[str, Any] = {"pool_size": 10, "max_overflow": 30, "hide_parameters": True}
+
+
+class Transactions(Protocol):
+    """Whole transactions on records, for code that leaves open whether one is tried again where the database is away.
+
+    What is given must take being called again.
+    """
+
+    def query(self, work: Callable[[Session], Result]) -> Result:
+        """The result of `work`, which reads one state of the database."""
+
+    def transact(self, work: Callable[[Session], Result]) -> Result:
+        """The result of `work`, whose changes are made."""
 
 
 class Database:
@@ -89,6 +102,11 @@ class Database:
             if self.engine.dialect.name == "sqlite":
                 session.connection(execution_options={"mrasfm_begin": "IMMEDIATE", "mrasfm_durable": durable})
             yield session
+
+    def query(self, work: Callable[[Session], Result]) -> Result:
+        """The result of `work` in a session of its own: see `read`."""
+        with self.read() as session:
+            return work(session)
 
     def transact(self, work: Callable[[Session], Result], *, durable: bool = True) -> Result:
         """The result of `work` in a transaction of its own: see `write`.

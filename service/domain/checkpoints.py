@@ -14,7 +14,7 @@ from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from schemas.artifacts import SCALES_CHECKPOINT, checkpoint_file, seam_checkpoint, submap_number
-from service.database.connections import Database
+from service.database.connections import Transactions
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
 from service.storage import blobs
@@ -76,7 +76,7 @@ _KEPT = (Blob.id, Blob.key)
 
 
 def restore(
-    database: Database,
+    records: Transactions,
     shelf: Shelf,
     folder: Path,
     *,
@@ -88,16 +88,15 @@ def restore(
     They save time and nothing else: one whose bytes are lost is forgotten, and the stage is done again. Only the store
     tells that they are: an attempt that was stopped removes its folder while this may be under way still.
     """
-    with database.read() as session:
-        found = {name: kept for name, kept in _shelved(session, shelf).items() if is_wanted(name)}
+    shelved = records.query(lambda session: _shelved(session, shelf))
+    found = {name: kept for name, kept in shelved.items() if is_wanted(name)}
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     names, lost = list(found), list[str]()
 
     def forget(place: int) -> None:
         name = names[place]
         log.warning("a finished stage is lost from the artifact store", extra={"fields": {"stage": name}})
-        with database.write() as session:
-            _forget(session, found[name].id)
+        records.transact(lambda session: _forget(session, found[name].id))
         lost.append(name)
 
     fetch_each(fetch, [(found[name].key, folder / name) for name in names], on_missing=forget)

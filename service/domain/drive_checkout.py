@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from sqlalchemy import select
+from sqlalchemy import Row, select
+from sqlalchemy.orm import Session
 
 from schemas.file_names import MANIFEST_NAME
-from service.database.connections import Database
+from service.database.connections import Transactions
 from service.database.tables import Blob, Drive, DriveFile
 from service.storage.artifacts import Fetch
 from service.storage.on_demand import OnDemandFolder, RemoteFile
@@ -60,7 +62,7 @@ class DriveCheckout:
 
 
 def check_out(
-    database: Database, drive_id: str, folder: Path, *, fetch: Fetch, units: range | None = None
+    records: Transactions, drive_id: str, folder: Path, *, fetch: Fetch, units: range | None = None
 ) -> DriveCheckout:
     """Begin a folder for a drive: its manifest comes, and it is known which files belong there.
 
@@ -76,16 +78,9 @@ def check_out(
     DriveGoneError
         Where the drive is not there any more.
     """
-    with database.read() as session:
-        manifest = session.scalar(
-            select(Blob).join(Drive, Drive.manifest_blob_id == Blob.id).where(Drive.id == drive_id)
-        )
-        if manifest is None:
-            raise DriveGoneError(drive_id)
-        stored = select(DriveFile.path, Blob.key, Blob.size_bytes, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
-        rows = session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
+    manifest_key, rows = records.query(partial(_stored, drive_id=drive_id))
     folder.mkdir(parents=True, mode=0o700)
-    fetch(manifest.key, folder / MANIFEST_NAME)
+    fetch(manifest_key, folder / MANIFEST_NAME)
     # Paths were checked when the manifest came: relative, without '..'.
     files = {path: RemoteFile(key, size_bytes) for path, key, size_bytes, _ in rows}
     wanted = _files_of_units(folder / MANIFEST_NAME, units)
@@ -94,6 +89,16 @@ def check_out(
         files={name: files[name] for name in wanted if name in files},
         content_sha256={path: sha256 for path, _, _, sha256 in rows},
     )
+
+
+def _stored(session: Session, drive_id: str) -> tuple[str, Sequence[Row[str, str, int, str]]]:
+    """Key of a drive's manifest, and path, key, size and SHA-256 of its files."""
+    manifest = select(Blob.key).join(Drive, Drive.manifest_blob_id == Blob.id).where(Drive.id == drive_id)
+    manifest_key = session.scalar(manifest)
+    if manifest_key is None:
+        raise DriveGoneError(drive_id)
+    stored = select(DriveFile.path, Blob.key, Blob.size_bytes, Blob.sha256).join(Blob, DriveFile.blob_id == Blob.id)
+    return manifest_key, session.execute(stored.where(DriveFile.drive_id == drive_id)).all()
 
 
 def _files_of_units(manifest: Path, units: range | None) -> dict[str, None]:

@@ -313,6 +313,77 @@ def test_database_that_is_away_when_an_attempt_ends(
     assert (world.job(job_id).state, world.outcomes(job_id)) == (states, [outcome])
 
 
+def break_statements(
+    runner: Runner, monkeypatch: pytest.MonkeyPatch, *parts: str, times: int | None = None
+) -> dict[str, int]:
+    """Make the database fail as it is given statements with such parts, so many times each or always.
+
+    What is left of these times is returned; it is below zero where such a statement was done.
+    """
+    dialect = runner._database.engine.dialect
+    execute = dialect.do_execute
+    left = dict.fromkeys(parts, 10**6 if times is None else times)
+
+    def do_execute(cursor: object, statement: str, *given: object, **options: object) -> None:
+        for part in parts:
+            if part in statement:
+                left[part] -= 1
+                if left[part] >= 0:
+                    raise sqlite3.OperationalError("the connection is lost")
+        execute(cursor, statement, *given, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(dialect, "do_execute", do_execute)
+    return left
+
+
+DRIVE_READ, SHELF_READ, WORKERS_READ = "drives.manifest_blob_id", "FROM checkpoints", "FROM workers"
+
+
+def test_database_that_is_away_when_an_attempt_begins(
+    world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As what others left is removed, the drive is brought, its workers are counted, and stages are found again."""
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    (world.settings.scratch_dir / "job_of_a_dead_process.7").mkdir(parents=True)
+    left = {SHELF_READ: 2}
+    settings = world.settings.model_copy(update={"submap_workers": None})
+    runner = Runner(settings, shutting_down=lambda: left[SHELF_READ] < 0)  # the engine is not needed
+    left = break_statements(runner, monkeypatch, DRIVE_READ, SHELF_READ, WORKERS_READ, times=2)
+    swept = runner.sweep_scratch
+    tries: list[bool] = []
+
+    def sweep_scratch() -> None:
+        tries.append(True)
+        if len(tries) < 3:
+            raise OperationalError("SELECT", {}, sqlite3.OperationalError("the connection is lost"))
+        swept()
+
+    monkeypatch.setattr(runner, "sweep_scratch", sweep_scratch)
+    runner.run(job_id)
+    assert (set(left.values()), len(tries)) == ({-1}, 3), "each was asked for again"
+    assert world.outcomes(job_id) == ["released"]
+    assert not (world.settings.scratch_dir / "job_of_a_dead_process.7").exists()
+
+
+def test_database_that_is_away_for_long_when_an_attempt_begins(
+    world: World, brief_drive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That is not the job's fault, and costs none of its retries."""
+    monkeypatch.setattr("worker.job_execution.RETRY_BUDGET_S", 0.5)
+    job_id = world.ask(world.add_drive(brief_drive), wake=False)
+    runner = Runner(world.settings)
+    left = break_statements(runner, monkeypatch, DRIVE_READ)
+    runner.run(job_id)
+    assert left[DRIVE_READ] <= 10**6 - 2
+    job = world.job(job_id)
+    assert (job.state, job.blame, job.losses) == ("QUEUED", 0.0, 1)
+    (attempt,) = world.attempts(job_id)
+    assert attempt.outcome == "database"
+    assert attempt.problem is not None
+    assert attempt.problem["title"] == "The database did not answer"
+    assert "connection is lost" not in json.dumps(attempt.problem)
+
+
 def test_what_is_not_the_databases_fault_is_not_tried_again(world: World, brief_drive: Path) -> None:
     job_id = world.ask(world.add_drive(brief_drive), wake=False)
     held = claimed(world, job_id)
