@@ -119,8 +119,7 @@ class ArtifactStore:
             it always does.
         """
         if self._root is None:
-            obstore.put(self._store, key, path)
-            path.unlink()
+            self._put_in_parts(path, key)
             return
         os.chmod(path, 0o440)
         target = self._root / key
@@ -154,12 +153,13 @@ class ArtifactStore:
                 if len(under_way) == _PUTS_OF_REQUEST:
                     done, under_way = wait(under_way, return_when=FIRST_COMPLETED)
                     _require_done(done)
-                under_way.add(self._putting.submit(self._put_beside_others, path, key))
+                under_way.add(self._putting.submit(self._put_in_parts, path, key))
         finally:
             wait(under_way)
         _require_done(under_way)
 
-    def _put_beside_others(self, path: Path, key: str) -> None:
+    def _put_in_parts(self, path: Path, key: str) -> None:
+        """Send a file; of a large one few parts at one time, each of which is in memory until the store has it."""
         obstore.put(self._store, key, path, max_concurrency=_PARTS_OF_PUT)
         path.unlink()
 

@@ -184,6 +184,29 @@ def test_many_files_are_put_at_one_time(
     assert puts.most == (8 if store.folder is None else 0)
 
 
+@pytest.mark.parametrize("put_at", ["put_file", "put_files"])
+def test_few_parts_of_a_large_file_are_in_memory(
+    store: ArtifactStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, put_at: str
+) -> None:
+    """By default 60 MB of each: forty requests that end at one time would hold 2.4 GB."""
+    (path := tmp_path / "large").write_bytes(bytes(12 << 20))
+    asked: list[dict[str, Any]] = []
+    put_now = obstore.put
+
+    def put(*given: Any, **options: Any) -> None:
+        asked.append(options)
+        put_now(*given, **options)
+
+    monkeypatch.setattr(obstore, "put", put)
+    if put_at == "put_file":
+        store.put_file(path, KEY)
+    else:
+        store.put_files([(path, KEY)])
+    assert asked == ([] if store.folder is not None else [{"max_concurrency": 2}])
+    assert store.sha256_of(KEY) == hashlib.sha256(bytes(12 << 20)).hexdigest()
+    assert not path.exists()
+
+
 def test_a_put_that_fails_leaves_none_under_way(
     store: ArtifactStore, twenty: list[tuple[Path, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:

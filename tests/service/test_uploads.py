@@ -342,6 +342,42 @@ def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
     assert answers == [204] * len(zips)
 
 
+def test_uploads_that_end_take_turns_on_the_disk(start_api: StartApi, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As files that are sent whole; each of them is hashed and, elsewhere than in a folder, in memory in parts."""
+    api = start_api(max_concurrent_writes=2)
+    client = api.client()
+    go_on, lock, under_way = threading.Event(), threading.Lock(), list[int]()
+    keep_now = file_ingest.keep_file
+
+    def keep_later(*given: Any) -> Any:
+        with lock:
+            under_way.append(len(under_way) + 1)
+        assert go_on.wait(30)
+        return keep_now(*given)
+
+    monkeypatch.setattr(upload_writing, "keep_file", keep_later)
+    drive = tiny_drive()
+    drive_id = client.create(drive)
+    urls = [create(client, drive_id, len(data), path=path).headers["location"] for path, data in drive.files.items()]
+    answers: list[int] = []
+
+    def send(url: str, data: bytes) -> None:
+        answers.append(patch(api.client_of(client.project_id, client.key), url, 0, data).status_code)
+
+    sending = [threading.Thread(target=send, args=one) for one in zip(urls, drive.files.values(), strict=True)]
+    try:
+        for thread in sending:
+            thread.start()
+        wait_until(lambda: api.context.disk.statistics().tasks_waiting == len(urls) - 2, "that all others wait")
+        assert under_way == [1, 2]
+    finally:
+        go_on.set()
+    for thread in sending:
+        thread.join(30)
+    assert answers == [204] * len(urls)
+    assert client.post(f"/v1/drives/{drive_id}:commit").status_code == 200
+
+
 def begun(client: Client, method: str, url: str, **headers: str) -> tuple[int, bytes]:
     """The answer to a request whose body does not come."""
     connection = HTTPConnection(urlsplit(client.api.url).netloc, timeout=10)

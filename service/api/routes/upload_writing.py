@@ -258,10 +258,11 @@ class _Held:
     async def complete(self, sha256: str | None) -> None:
         """Make the bytes the drive's once all are there; `sha256` of all of them, where it is known.
 
-        Only what unpacks takes a place of those that may.
+        Only what unpacks takes a place of those that may. A file takes a place on the disk, as the end of a PUT does:
+        the thread that has it takes no other place, and needs none of those who wait.
         """
         if self.offset == self.upload.size_bytes and not self.upload.is_done:
-            limiter = self._context.unpacking if self.upload.path is None else None
+            limiter = self._context.unpacking if self.upload.path is None else self._context.disk
             await anyio.to_thread.run_sync(self._complete, sha256, limiter=limiter)
 
     def _complete(self, sha256: str | None) -> None:
