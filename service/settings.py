@@ -96,6 +96,11 @@ _IN_STEP = (
     ("terminate_after_seconds", "at most", "kill_after_seconds"),
 )
 
+# docker-compose.yml alone reads these; they reach its containers with the settings of .env.
+_OF_COMPOSE = frozenset(
+    {"MRASFM_LISTEN", "MRASFM_WORKERS", "MRASFM_WORKER_MEMORY", "MRASFM_CHECKER_MEMORY", "MRASFM_VERSION"}
+)
+
 
 class Settings(BaseSettings):
     """Settings of one process. Sizes are in bytes, times in the unit of the name."""
@@ -336,7 +341,7 @@ def misspelt_variables(environment: Mapping[str, str]) -> Iterator[str]:
     """
     for variable in sorted(environment):
         prefix, _, name = variable.lower().partition("_")
-        if prefix == "mrasfm" and name not in Settings.model_fields:
+        if prefix == "mrasfm" and name not in Settings.model_fields and variable not in _OF_COMPOSE:
             meant = similar_name(name, Settings.model_fields)
             if meant is not None:
                 yield f"{variable} is no setting and has no effect; did you mean MRASFM_{meant.upper()}?"

@@ -6,10 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from mrasfm_engine.learned.model_folder import FOLDER_VARIABLE
 from service.database.connections import Database
-from service.settings import Settings
+from service.settings import Settings, misspelt_variables
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 COMPOSE = (REPOSITORY / "docker-compose.yml").read_text(encoding="utf-8")
@@ -21,6 +22,28 @@ def test_every_setting_that_it_passes_exists() -> None:
     assert passed >= {"MRASFM_DATABASE_URL", "MRASFM_REDIS_URL", "MRASFM_ARTIFACTS_URL"}
     of_the_service = {f"MRASFM_{name.upper()}" for name in Settings.model_fields}
     assert passed <= of_the_service | {FOLDER_VARIABLE}  # of the engine: where trained models lie
+
+
+def test_every_setting_of_the_environment_file_reaches_the_service() -> None:
+    """What the file of compose sets itself comes before it: `environment` does before `env_file`."""
+    document = YAML(typ="safe").load(COMPOSE)
+    of_the_service = {
+        name: service for name, service in document["services"].items() if str(service["image"]).startswith("mrasfm:")
+    }
+    assert of_the_service.keys() == {"migrate", "api", "worker", "checker", "reconciler"}
+    for service in of_the_service.values():
+        assert service["env_file"] == [{"path": ".env", "required": False}]
+        assert service["environment"]["MRASFM_DATA_DIR"] == "/data", "not a folder of the host"
+    assert of_the_service["api"]["environment"]["MRASFM_PORT"] == "8000", "not the port of the host"
+    others = document["services"].keys() - of_the_service.keys()
+    assert not any("env_file" in document["services"][name] for name in others)
+
+
+def test_what_compose_alone_reads_is_not_taken_for_a_misspelt_setting() -> None:
+    read = set(re.findall(r"\$\{(MRASFM_\w+):", COMPOSE))
+    assert {"MRASFM_WORKERS", "MRASFM_LISTEN", "MRASFM_WORKER_MEMORY", "MRASFM_VERSION"} <= read
+    assert list(misspelt_variables(dict.fromkeys(read, "1"))) == []
+    assert len(list(misspelt_variables({"MRASFM_MAX_ATTEMPT": "1", "MRASFM_WORKER": "1"}))) == 2
 
 
 def test_secrets_are_required_and_have_no_value_anywhere() -> None:
