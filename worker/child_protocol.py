@@ -39,7 +39,7 @@ class Attempt:
     Attributes
     ----------
     drive
-        Folder with `drive.json` and the files it names; None for an aggregation.
+        Folder with `drive.json` and the files it names; None for an aggregation or an export.
     content_sha256
         SHA-256 of these files by name: what finished stages are found again by.
     files

@@ -190,7 +190,7 @@ def _written_report(out: Path) -> dict[str, Any]:
 
 
 def _drive_of(request: ChildRequest) -> Path:
-    assert request.drive is not None, "only an aggregation has none"
+    assert request.drive is not None, "only aggregations and exports have none"
     return request.drive
 
 

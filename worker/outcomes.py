@@ -32,7 +32,8 @@ class Succeeded:
     ----------
     report
         Of a reconstruction or aggregation, what `report.json` says, and of the latter what the version's record has of
-        `map.json` as `map`; of a preflight, `findings` and `sound`; of a sub-map, `reused`.
+        `map.json` as `map`; of a preflight, `findings` and `sound`; of a sub-map, `stages`, and whether
+        each was reused; of an export, `results`, what became of each format.
     out
         Folder of the scene.
     """

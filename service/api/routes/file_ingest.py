@@ -98,7 +98,7 @@ def keep_file(
     Raises
     ------
     ServiceError
-        415 or 422 where they are no image, 404, 409, 413 as `slots`.
+        415 or 422 where they are no image, 404, 409, 413 as in `drive_files`.
     """
     try:
         check_image(spooled.path, path)

@@ -25,7 +25,7 @@ TERMINAL = frozenset({JobState.SUCCEEDED, JobState.FAILED, JobState.CANCELLED})
 
 
 class Job(Base):
-    """Work that was accepted. `persistence.jobs` holds the only statements that change its state."""
+    """Work that was accepted. `service.domain.jobs` holds the only statements that change its state."""
 
     __tablename__ = "jobs"
     __table_args__ = (
@@ -42,7 +42,7 @@ class Job(Base):
     # No foreign keys: a job's record outlives the drive and the map. An aggregation has no drive, only it has a map.
     drive_id: Mapped[str | None] = mapped_column(Id, index=True)
     map_id: Mapped[str | None] = mapped_column(Id, index=True)
-    request: Mapped[dict[str, Any] | None]  # of an aggregation, as asked; of a sub-map, its place in the drive
+    request: Mapped[dict[str, Any] | None]  # of an aggregation, as asked; of a sub-map, its place; of an export, its id
     settings: Mapped[dict[str, Any]] = mapped_column(default=dict)
     state: Mapped[str] = mapped_column(String(16), default=JobState.QUEUED)
     revision: Mapped[int] = mapped_column(default=1)  # rises with every change that a reader can see
