@@ -330,7 +330,7 @@ def break_statements(
                 left[part] -= 1
                 if left[part] >= 0:
                     raise sqlite3.OperationalError("the connection is lost")
-        execute(cursor, statement, *given, **options)  # type: ignore[arg-type]
+        execute(cursor, statement, *given, **options)
 
     monkeypatch.setattr(dialect, "do_execute", do_execute)
     return left
