@@ -152,16 +152,9 @@ def assess_intrinsics(
     is_single, by_default = mapper.drive.has_single_camera, mapper.config.bundle_adjustment.refine_focal is None
     declared = np.array([camera.declares_intrinsics for camera in given.cameras])
     may_be_distorted = asked & (declared | by_default | is_single)
+    others_vary = asked & (declared | (by_default and not is_single))
     take_models(mapper, given, may_be_distorted)
-    decision = _decided(
-        mapper,
-        asked,
-        asked & (declared | (by_default and not is_single)),
-        free_units=free_units,
-        terms=terms,
-        options=options,
-        cancel=cancel,
-    )
+    decision = _decided(mapper, asked, others_vary, free_units=free_units, terms=terms, options=options, cancel=cancel)
     take_models(mapper, given, may_be_distorted & decision.distortion_varies)
     return decision
 
