@@ -28,7 +28,6 @@ from schemas import DriveManifest
 
 CAMERA, IMU = "CAMERA", "IMU"  # sensors, in a text model
 POINTS_AT_ONE_TIME = 20_000
-USUAL_NAME_BYTES = 128  # of an image, and more
 POINT_HEAD = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("color", "u1", 3), ("error", "<f8"), ("length", "<u8")])
 
 
@@ -120,7 +119,7 @@ def images_binary(path: Path) -> Iterator[ModelImage]:
         (images,) = struct.unpack("<Q", _exactly(file, 8))
         for _ in range(images):
             image_id, *numbers, camera_id = struct.unpack("<I7dI", _exactly(file, 64))
-            name = _until_zero(file).decode("utf-8")
+            name = b"".join(iter(partial(_exactly, file, 1), b"\0")).decode("utf-8")
             (count,) = struct.unpack("<Q", _exactly(file, 8))
             rows = np.frombuffer(_exactly(file, 24 * count), dtype=[("xy", "<f8", 2), ("point", "<i8")])
             yield ModelImage(image_id, camera_id, name, numbers, rows["xy"], rows["point"])
@@ -134,18 +133,6 @@ def _exactly(file: BinaryIO, count: int) -> bytes:
     if len(data) != count:
         raise ValueError("it ends early")
     return data
-
-
-def _until_zero(file: BinaryIO) -> bytes:
-    """Bytes before the next zero, which is read as well. A byte at a time would take most of the time of reading."""
-    begin, data = file.tell(), b""
-    while (end := data.find(b"\0")) < 0:
-        more = file.read(USUAL_NAME_BYTES)
-        if not more:
-            raise ValueError("it ends early")
-        data += more
-    file.seek(begin + end + 1)
-    return data[:end]
 
 
 def cameras_text(path: Path) -> dict[int, CameraRead]:

@@ -125,9 +125,8 @@ def _images(binary: ModelRead, binary_folder: Path, path: Path) -> Rows:
 
 def _image(found: ModelImage, known: ModelImage) -> Rows:
     yield Row(f"image {known.image_id}", (found.name, found.camera_id), (known.name, known.camera_id))
-    if found.cam_from_world != known.cam_from_world:  # the same numbers are one pose
-        poses = [readers.pose(image.cam_from_world) for image in (found, known)]
-        yield Row(f"the pose of {known.name}", poses[0], poses[1], POSE_TOLERANCE)
+    poses = [readers.pose(image.cam_from_world) for image in (found, known)]
+    yield Row(f"the pose of {known.name}", poses[0], poses[1], POSE_TOLERANCE)
     yield Row(f"a keypoint of {known.name}", found.xy_px, known.xy_px, POSE_TOLERANCE)
     yield Row(f"a point seen in {known.name}", found.point_ids, known.point_ids)
 

@@ -71,8 +71,6 @@ def _keypoints(scene: Scene, image: int, mine: Ints, keypoints: np.ndarray[Any, 
     """Keypoints of an image beside its observations, rows `mine` of the scene's."""
     observed = keypoints[keypoints["point"] != NO_POINT]
     yield Row("observations of an image", len(observed), len(mine))
-    if not len(mine):  # of a unit of a stop
-        return
     wanted = scene.features[image].xy_px[scene.observation_keypoint[mine]]
     order, by_point = np.argsort(scene.observation_point[mine]), np.argsort(observed["point"])
     agree = np.allclose(observed["xy_px"][by_point], wanted[order], atol=1e-3)
