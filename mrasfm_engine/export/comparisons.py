@@ -86,8 +86,7 @@ def images(scene: Scene, found: Iterator[ModelImage]) -> Rows:
     for k in np.flatnonzero(~(np.abs(np.linalg.norm(numbers[:, :4], axis=1) - 1.0) < QUATERNION_TOLERANCE)):
         yield Row(f"the length of the quaternion of {read[k][0]}", np.linalg.norm(numbers[k, :4]), 1.0)
     composed = transforms(np.roll(numbers[:, :4], -1, axis=1), numbers[:, 4:])
-    for (name, _), pose, known in zip(read, composed, expected, strict=True):
-        yield Row(f"the pose of {name}", pose, known, POSE_TOLERANCE)
+    yield from _different([f"the pose of {name}" for name, _ in read], composed, np.reshape(expected, (-1, 4, 4)))
     yield Row("what it lacks of the registered images", [scene.drive.images[i].file for i in missing], [])
 
 
@@ -98,20 +97,29 @@ def model(scene: Scene, found: ModelRead) -> Rows:
     posed = [number for number, image in found.images.items() if image.cam_from_world is not None]
     yield Row("images: the registered ones", sorted(found.images), (registered + 1).tolist())
     yield Row("images: those with a pose", sorted(posed), (registered + 1).tolist())
-    counts, centres = np.bincount(scene.observation_image, minlength=len(scene.drive.images)), []
-    for i, pose in zip(registered.tolist(), np.linalg.inv(_registered_poses(scene)), strict=True):
+    counts, composed = np.bincount(scene.observation_image, minlength=len(scene.drive.images)), list[Floats]()
+    for i in registered.tolist():
         image, source = found.images[i + 1], scene.drive.images[i]
         described = (image.name, image.camera_id, image.frame_id, image.keypoints, image.observations)
         expected = (source.file, source.camera + 1, frame_of_image(scene, i), len(scene.features[i].xy_px), counts[i])
         yield Row("images: name, camera, frame, keypoints, observations", described, expected)
-        composed = np.asarray(image.cam_from_world)
-        yield Row(f"images: the composed pose of {source.file}", composed, pose[:3], POSE_TOLERANCE)
-        centres.append(-composed[:, :3].T @ composed[:, 3])
-    yield from _baselines(scene, np.reshape(centres, (-1, 3)))
+        composed.append(np.asarray(image.cam_from_world))
+    poses = np.reshape(composed, (-1, 3, 4))
+    known = np.asarray(np.linalg.inv(_registered_poses(scene))[:, :3], dtype=np.float64)
+    yield from _different(
+        [f"images: the composed pose of {scene.drive.images[i].file}" for i in registered], poses, known
+    )
+    yield from _baselines(scene, -np.einsum("nji,nj->ni", poses[:, :, :3], poses[:, :, 3]))
     yield Row("points3D: their number", len(found.points), len(scene.points_m))
     yield Row("points3D: observations", found.observations, len(scene.observation_point))
     yield Row("the model's consistency, as COLMAP finds it,", found.is_valid, True)
     yield Row("points3D: a point", found.points, scene.points_m, POSE_TOLERANCE)
+
+
+def _different(names: Sequence[str], found: Floats, expected: Floats) -> Rows:
+    """Rows of the poses (n, r, 4) that are not the expected ones."""
+    for k in np.flatnonzero(~(np.abs(found - expected) <= POSE_TOLERANCE).all(axis=(1, 2))).tolist():
+        yield Row(names[k], found[k], expected[k], POSE_TOLERANCE)
 
 
 def _rigs_and_cameras(scene: Scene, found: ModelRead) -> Rows:

@@ -7,6 +7,7 @@ places that the document names.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +19,7 @@ from mrasfm_engine.scene.scene import Scene
 from mrasfm_engine.types import Floats, Ints
 
 ROUNDED_M = 2e-3
+PIXEL_TOLERANCE = 1e-3
 NO_POINT = 2**64 - 1
 KEYPOINT = np.dtype([("xy_px", "<f8", 2), ("point", "<u8")])
 
@@ -49,32 +51,34 @@ def view(scene: Scene, read: View) -> Rows:
     found = _places([position for one in document["scenes"] for position in one["trajectory_m"]], document)
     wanted = _expected(scene, scene.world_from_rig[np.array(units, dtype=np.int64), :3, 3], document)
     yield Row("positions agree", bool(np.abs(found - wanted).max(initial=0.0) < ROUNDED_M), True)
-    order = np.argsort(scene.observation_image, kind="stable")
-    bounds = np.searchsorted(scene.observation_image[order], np.arange(len(scene.drive.images) + 1))
     by_name = {image.file: index for index, image in enumerate(scene.drive.images)}
-    shown, centres = [], []
+    shown, centres, observed = [], [], list[np.ndarray[Any, Any]]()
     for one in document["scenes"]:
         for image in one["images"]:
             file = image["file"] if image["file"] in by_name else f"{one['name']}/{image['file']}"
-            index = by_name[file]
-            shown.append(index)
+            shown.append(by_name[file])
             centres.append(image["frustum_m"][0])
-            rows = order[bounds[index] : bounds[index + 1]]
-            yield from _keypoints(scene, index, rows, read.keypoints[one["name"], image["file"]])
+            keypoints = read.keypoints[one["name"], image["file"]]
+            observed.append(keypoints[keypoints["point"] != NO_POINT])
     yield Row("registered images", sorted(shown), np.flatnonzero(scene.image_registered).tolist())
+    yield from _observations(scene, np.array(shown, dtype=np.int64), observed)
     wanted = _expected(scene, scene.world_from_cam[np.array(shown, dtype=np.int64), :3, 3], document)
     difference = np.abs(_places(centres, document) - wanted).max(initial=0.0)
     yield Row("centres of the cameras agree", bool(difference < ROUNDED_M), True)
 
 
-def _keypoints(scene: Scene, image: int, mine: Ints, keypoints: np.ndarray[Any, Any]) -> Rows:
-    """Keypoints of an image beside its observations, rows `mine` of the scene's."""
-    observed = keypoints[keypoints["point"] != NO_POINT]
-    yield Row("observations of an image", len(observed), len(mine))
-    wanted = scene.features[image].xy_px[scene.observation_keypoint[mine]]
-    order, by_point = np.argsort(scene.observation_point[mine]), np.argsort(observed["point"])
-    agree = np.allclose(observed["xy_px"][by_point], wanted[order], atol=1e-3)
-    yield Row("pixels of the observations agree", bool(agree), True)
+def _observations(scene: Scene, images: Ints, observed: Sequence[np.ndarray[Any, Any]]) -> Rows:
+    """Keypoints that observe a point, of each of some images (n,), beside the scene's observations."""
+    counts = np.bincount(scene.observation_image, minlength=len(scene.drive.images))
+    yield Row("the numbers of the images' observations", [len(rows) for rows in observed], counts[images].tolist())
+    if not counts[images].any():
+        return
+    found = np.concatenate(observed)
+    found = found[np.lexsort((found["point"], np.repeat(images, counts[images])))]
+    mine = np.lexsort((scene.observation_point, scene.observation_image))
+    of_image = np.split(scene.observation_keypoint[mine], np.cumsum(counts)[:-1])
+    seen = [scene.features[i].xy_px[of_image[i]] for i in np.flatnonzero(counts)]
+    yield Row("pixels of the observations", found["xy_px"], np.concatenate(seen), PIXEL_TOLERANCE)
 
 
 def _places(positions: list[list[float]], document: dict[str, Any]) -> Floats:

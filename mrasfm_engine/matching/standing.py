@@ -4,7 +4,7 @@ A minute at a red light is hundreds of units that show the same. Of a stop the f
 those between take no part in the reconstruction and get their poses from these two (see `scene.standing_units`).
 
 Each unit is compared with the last one that moved, so that the steps of a creeping car add up. While the car stands
-three units a second are, and what lies between two that stand where the same unit does stands there as well. Where the
+two units a second are, and what lies between two that stand where the same unit does stands there as well. Where the
 prior trajectory shows motion no image is read.
 """
 
@@ -31,8 +31,8 @@ from mrasfm_engine.types import Bools, Cancel, Floats, Floats32, Ints
 # The prior shows motion where it went this many sigmas, and a metre, within a window.
 MOVED_SIGMAS, MOVED_M = 6.0, 1.0
 WINDOWS_S = (0.5, 1.0, 2.0)  # before the unit, and after it: a stop of two seconds and more is seen
-# A car that accelerates and brakes by 4 m/s^2 gets no farther than 3 cm and back within this time.
-UNREAD_S = 0.35
+# A car that accelerates and brakes by 4 m/s^2 gets no farther than 6 cm and back within this time.
+UNREAD_S = 0.5
 AHEAD = 2  # units that wait to be looked at, by thread
 
 

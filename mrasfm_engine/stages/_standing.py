@@ -15,7 +15,7 @@ from mrasfm_engine.scene.standing_units import with_standing_units, without_unit
 from mrasfm_engine.stages._run import Run
 from mrasfm_engine.types import Ints
 
-STANDING, STANDING_VERSION = "standing", 5
+STANDING, STANDING_VERSION = "standing", 6
 
 
 def leave_out_standing(run: Run, known: PriorTrajectory) -> PriorTrajectory:

@@ -69,12 +69,14 @@ def stop_px(unit: int) -> float:
 
 
 def test_the_first_and_the_last_unit_of_a_stop_are_kept(tmp_path: Path) -> None:
-    found = standing_of(write(tmp_path, 11, lambda unit, camera: view(camera, stop_px(unit))))
-    assert found.included.tolist() == [True] * 3 + [False] * 4 + [True] * 4
-    assert found.spans() == [(2, 7)]
+    found = standing_of(
+        write(tmp_path, 13, lambda unit, camera: view(camera, 25.0 * (min(unit, 2) + max(unit - 9, 0))))
+    )
+    assert found.included.tolist() == [True] * 3 + [False] * 6 + [True] * 4
+    assert found.spans() == [(2, 9)]
     assert np.isnan(found.moved_px[found.included]).all()
     assert found.moved_px[~found.included].max() < 0.5, "noise is no motion"
-    assert found.compared == 9, "4 and 5 lie between two that stand"
+    assert found.compared == 9, "4 to 7 lie between two that stand"
 
 
 def test_jpegs_in_colour_with_noise_of_each_channel(tmp_path: Path) -> None:
