@@ -412,6 +412,8 @@ def _keypoints(
             counts[i] = len(found.xy_px)
             xy.append(found.xy_px)
             point.append(found.point)
+            if not counts[i]:
+                continue
             row = db.execute("SELECT rows, cols, data FROM descriptors WHERE image_id = ?", (i + 1,)).fetchone()
             if row is None:
                 raise ValueError(f"it has no descriptors of image {i + 1}")

@@ -242,7 +242,7 @@ def features(scene: Scene, select: Callable[[str], Iterator[Any]]) -> Rows:
     )
     params = [row[0] for row in select("SELECT params FROM cameras ORDER BY camera_id")]
     yield Row("its camera parameters", params, [model.params.tobytes() for model in colmap_models(scene)])
-    by_image = dict(enumerate(scene.features, 1))
+    by_image = {i: found for i, found in enumerate(scene.features, 1) if len(found.xy_px)}
     for table, column in (("keypoints", "xy_px"), ("descriptors", "descriptors")):
         rows = select(f"SELECT image_id, rows, data FROM {table}")
         yield from _table(table, rows, by_image, attrgetter(column))

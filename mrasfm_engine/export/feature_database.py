@@ -118,9 +118,10 @@ def _write_images(content: _Content, database: pycolmap.Database) -> None:
     for i, (image, features) in enumerate(zip(content.drive.images, content.features, strict=True)):
         written = pycolmap.Image(name=image.file, camera_id=image.camera + 1, image_id=i + 1)
         database.write_image(written, use_image_id=True)
-        database.write_keypoints(i + 1, np.ascontiguousarray(features.xy_px, dtype=np.float32))
-        if content.descriptors:
-            database.write_descriptors(i + 1, _descriptors(features))
+        if len(features.xy_px):  # of an image without a row COLMAP knows no keypoints: those of a stop are many
+            database.write_keypoints(i + 1, np.ascontiguousarray(features.xy_px, dtype=np.float32))
+            if content.descriptors:
+                database.write_descriptors(i + 1, _descriptors(features))
         frame_id = content.frames[i]
         frame = frames.setdefault(frame_id, pycolmap.Frame(frame_id=frame_id, rig_id=RIG_ID))
         sensor = pycolmap.sensor_t(pycolmap.SensorType.CAMERA, image.camera + 1)

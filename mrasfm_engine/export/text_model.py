@@ -125,9 +125,10 @@ def _images(binary: ModelRead, binary_folder: Path, path: Path) -> Rows:
 
 def _image(found: ModelImage, known: ModelImage) -> Rows:
     yield Row(f"image {known.image_id}", (found.name, found.camera_id), (known.name, known.camera_id))
-    # COLMAP writes the numbers that it has read: the same pose in others would be another model.
-    poses = [np.array(image.cam_from_world) for image in (found, known)]
-    yield Row(f"the pose of {known.name}", poses[0], poses[1], POSE_TOLERANCE)
+    written, pose = np.array(found.cam_from_world), np.array(known.cam_from_world)
+    # A quaternion and its negative are one rotation; in text COLMAP writes the one with a positive w.
+    written[:4] *= np.copysign(1.0, written[:4] @ pose[:4])
+    yield Row(f"the pose of {known.name}", written, pose, POSE_TOLERANCE)
     yield Row(f"a keypoint of {known.name}", found.xy_px, known.xy_px, POSE_TOLERANCE)
     yield Row(f"a point seen in {known.name}", found.point_ids, known.point_ids)
 

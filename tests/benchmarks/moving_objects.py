@@ -112,7 +112,9 @@ class VerifiedTracks:
     @staticmethod
     def read(scene: Path, rendered: Path) -> VerifiedTracks:
         with closing(sqlite3.connect(f"file:{scene / 'features.db'}?mode=ro", uri=True)) as db:
-            rows = db.execute("SELECT name, rows, data FROM images JOIN keypoints USING (image_id) ORDER BY image_id")
+            rows = db.execute(
+                "SELECT name, IFNULL(rows, 0), data FROM images LEFT JOIN keypoints USING (image_id) ORDER BY image_id"
+            )
             moves = [_moves(rendered, *row) for row in rows.fetchall()]
             pairs = db.execute("SELECT pair_id, rows, data FROM two_view_geometries").fetchall()
         first = np.concatenate([[0], np.cumsum([len(m) for m in moves])])

@@ -114,6 +114,15 @@ def test_a_word_that_is_off_is_found(
     assert fault(file, lines).startswith(f"{file}: {what}")
 
 
+def test_a_quaternion_and_its_negative_are_one_pose(
+    lines_of: Callable[[str], list[str]], fault: Callable[[str, list[str]], str]
+) -> None:
+    lines = lines_of("images.txt")
+    number, *words = lines[-2].split(" ")
+    negative = [str(-float(word)) for word in words[:4]]
+    assert fault("images.txt", [*lines[:-2], " ".join([number, *negative, *words[4:]]), lines[-1]]) == ""
+
+
 @pytest.mark.parametrize("file", FILES)
 def test_a_file_that_ends_early(
     lines_of: Callable[[str], list[str]], fault: Callable[[str, list[str]], str], file: str
