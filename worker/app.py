@@ -17,7 +17,7 @@ from service.logs import configure
 from service.pdeathsig import end_with_parent
 from service.settings import Settings
 from worker.job_execution import Runner
-from worker.lease import RenewLeases, ReportPresence
+from worker.lease import RenewLeases, ReportPresence, report_leaving
 
 log = logging.getLogger("mrasfm.worker")
 
@@ -108,6 +108,10 @@ def make_app(settings: Settings, *, log_level: str = "INFO") -> Celery:
     @signals.worker_shutting_down.connect(weak=False)
     def _stop(**_: Any) -> None:
         flag.set()
+
+    @signals.worker_shutdown.connect(weak=False)
+    def _leave(sender: Any, **_: Any) -> None:
+        report_leaving(settings, sender.hostname)
 
     @signals.worker_process_init.connect(weak=False)
     def _begin(**_: Any) -> None:

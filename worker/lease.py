@@ -12,13 +12,17 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from celery import bootsteps
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
 from service.database.connections import Database
 from service.domain import workers
+from service.settings import Settings
 
 log = logging.getLogger("mrasfm.worker")
 
@@ -66,17 +70,26 @@ class ReportPresence(_Repeated):
 
     def do(self, consumer: Any) -> None:
         """Report it once."""
-        # Opened for each report: pool processes are forked from this one and must not share a connection with it.
-        database = Database(consumer.app.mrasfm_settings.resolved_database_url, timeout_s=_DATABASE_TIMEOUT_S)
-        try:
-            with database.write() as session:
-                workers.report(
-                    session,
-                    name=consumer.hostname,
-                    queues=sorted(consumer.app.amqp.queues.consume_from),
-                    concurrency=consumer.controller.concurrency,
-                )
-        except SQLAlchemyError:
-            log.warning("the database did not take this worker's report", exc_info=True)
-        finally:
-            database.close()
+        queues = sorted(consumer.app.amqp.queues.consume_from)
+        with _records(consumer.app.mrasfm_settings) as session:
+            workers.report(session, name=consumer.hostname, queues=queues, concurrency=consumer.controller.concurrency)
+
+
+def report_leaving(settings: Settings, name: str) -> None:
+    """Report that a worker was told to stop and has stopped."""
+    with _records(settings) as session:
+        workers.leave(session, name)
+
+
+@contextmanager
+def _records(settings: Settings) -> Iterator[Session]:
+    """A transaction; a database that does not take it is logged, and the worker goes on."""
+    # Opened for each report: pool processes are forked from this one and must not share a connection with it.
+    database = Database(settings.resolved_database_url, timeout_s=_DATABASE_TIMEOUT_S)
+    try:
+        with database.write() as session:
+            yield session
+    except SQLAlchemyError:
+        log.warning("the database did not take this worker's report", exc_info=True)
+    finally:
+        database.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -20,11 +21,9 @@ from service.database.tables import (
     JobMember,
     Map,
     MapScene,
-    Pass,
     Scene,
-    now_us,
 )
-from service.domain import exports, job_trees, jobs, maps, webhooks, workers
+from service.domain import exports, job_trees, jobs, maps, passes, webhooks, workers
 from service.job_queue import BrokerError, JobQueue, task_id
 from service.logs import log_fields
 from service.settings import Settings
@@ -41,9 +40,9 @@ _SWEEP_RESTS = 9.0  # times as long as it took: of millions of files it takes mi
 _ORPHANS_FIRST_S = 300.0
 _ORPHANS_CHECK_EVERY_S = 600.0
 _ORPHANS_EVERY_US = 24 * _HOUR_US  # not with every restart: listing a store costs time and, in the cloud, money
-_ORPHANS = "orphans"
 _END_WITHIN_S = 5.0
 _BATCH = 500
+_NOTED_EVERY_S = 10.0  # passes of a second are not written down one by one
 
 
 class Reconciler:
@@ -58,6 +57,7 @@ class Reconciler:
         self._broker_was_there = True
         self._clock_guard = ClockGuard(settings.lease_seconds)
         self._limits = jobs.RetryLimits.from_settings(settings)
+        self._noted_s: dict[str, float] = {}
 
     def close(self) -> None:
         """Close the connections to the database."""
@@ -71,14 +71,14 @@ class Reconciler:
         threads = [
             threading.Thread(target=self._repeat, args=(ended, *task), name=task[0], daemon=True)
             for task in (
-                ("sweep", self.sweep, _SWEEP_EVERY_S, 0.0, _SWEEP_RESTS),
-                ("webhooks", lambda: self._webhooks.send_due(ended), self._settings.webhook_seconds, 0.0),
-                ("orphans", self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
+                (passes.SWEEP, self.sweep, _SWEEP_EVERY_S, 0.0, _SWEEP_RESTS),
+                (passes.WEBHOOKS, lambda: self._webhooks.send_due(ended), self._settings.webhook_seconds, 0.0),
+                (passes.ORPHANS, self.collect_orphans, _ORPHANS_CHECK_EVERY_S, _ORPHANS_FIRST_S),
             )
         ]
         for thread in threads:
             thread.start()
-        self._repeat(ended, "jobs", self.reconcile_jobs, self._settings.reconcile_seconds, 0.0)
+        self._repeat(ended, passes.JOBS, self.reconcile_jobs, self._settings.reconcile_seconds, 0.0)
         for thread in threads:
             thread.join(_END_WITHIN_S)  # what is cut short is done by the next one
 
@@ -94,14 +94,26 @@ class Reconciler:
         ended.wait(first_s)
         while not ended.is_set():
             begun_s = time.monotonic()
-            self._try(what, step)
+            if self._try(what, step) and what != passes.ORPHANS:
+                self._try(what, lambda: self._note(what))
             ended.wait(max(every_s, rests * (time.monotonic() - begun_s)))
 
-    def _try(self, what: str, step: Callable[[], object]) -> None:
+    def _try(self, what: str, step: Callable[[], object]) -> bool:
+        """Make a pass, or a part of one; whether it went well."""
         try:
             step()
         except Exception:  # the next pass tries again
             log.exception("a pass failed", extra={"fields": {"pass": what}})
+            return False
+        return True
+
+    def _note(self, what: str) -> None:
+        """Note the pass where the status and the metrics find it."""
+        if time.monotonic() < self._noted_s.get(what, -math.inf) + _NOTED_EVERY_S:
+            return
+        with self._database.write() as session:
+            passes.note(session, what)
+        self._noted_s[what] = time.monotonic()
 
     def reconcile_jobs(self) -> None:
         """Free jobs whose worker is silent, and wake workers up for those that wait and have no message."""
@@ -146,23 +158,25 @@ class Reconciler:
 
     def sweep(self) -> None:
         """Delete what has passed its retention date, and bytes that nothing needs."""
-        self._try("retention", self._expire)
-        _tell(collect_unused(self._database, self._artifacts))
+        try:
+            self._expire()
+        finally:  # what expires and cannot be deleted holds up nothing else
+            _tell(collect_unused(self._database, self._artifacts))
 
     def collect_orphans(self) -> None:
         """Delete bytes that no record names, once a day by all reconcilers: all of the store is listed for it."""
         with self._database.read() as session:
-            last = session.get(Pass, _ORPHANS)
-            age_us = None if last is None else now_us() - last.done_us
+            last = passes.last_us(session).get(passes.ORPHANS)
+            age_us = None if last is None else clock_us(session) - last
         if age_us is not None and 0 <= age_us < _ORPHANS_EVERY_US:
             return
         _tell(collect_orphans(self._database, self._artifacts))
         with self._database.write() as session:
-            session.merge(Pass(name=_ORPHANS, done_us=now_us()))
+            passes.note(session, passes.ORPHANS)
 
     def _expire(self) -> None:
         """Each transaction is short: while one deletes, SQLite lets no worker say that it lives."""
-        now = now_us()
+        now = self._database.query(clock_us)
         # Of their own: aggregations lock maps and scenes before drives.
         self._in_batches(lambda session: exports.forget_expired(session, now))
         self._in_batches(lambda session: webhooks.forget_old(session, now))

@@ -26,7 +26,7 @@ _WORKER: JsonDict = {
     "seen_at": "2026-05-04T09:33:40Z",
     "online": True,
 }
-_QUEUE: JsonDict = {"queued": 2, "running": 1, "stalled": 0}
+_QUEUE: JsonDict = {"queued": 2, "running": 1, "stalled": 0, "longest_wait_seconds": 12.5}
 _DISK: JsonDict = {"free_bytes": 80_000_000_000, "total_bytes": 250_000_000_000, "accepts_uploads": True}
 
 
@@ -50,6 +50,9 @@ class QueueStatus(Resource):
     queued: int = Field(description="jobs that wait")
     running: int = Field(description="jobs that a worker holds, stalled ones too")
     stalled: int = Field(description="running jobs without a recent heartbeat")
+    longest_wait_seconds: float = Field(
+        description="how long the oldest of the jobs that wait for nothing but a worker has waited; 0 without one"
+    )
 
 
 class DiskStatus(Resource):
@@ -73,6 +76,7 @@ class ServiceStatus(Resource):
                     "reasons": ["the broker does not answer: jobs are accepted and start when it is back"],
                     "version": "0.2.0",
                     "broker": False,
+                    "reconciler": True,
                     "workers": [_WORKER],
                     "queue": _QUEUE,
                     "disk": _DISK,
@@ -85,7 +89,10 @@ class ServiceStatus(Resource):
     reasons: list[str] = Field(description="what does not work, and what that means")
     version: str = Field(description="of the service")
     broker: bool = Field(description="whether it answers")
-    workers: list[WorkerStatus] = Field(description="that reported within the last day")
+    reconciler: bool = Field(description="whether one has looked after the jobs within the last minute")
+    workers: list[WorkerStatus] = Field(
+        description="that reported within the last day; one that was told to stop is not among them"
+    )
     queue: QueueStatus = Field(description="jobs of all projects")
     disk: DiskStatus = Field(description="where uploads are received")
 

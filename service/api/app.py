@@ -89,7 +89,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     """The API as an ASGI application, with the settings of the environment by default."""
     settings = settings or Settings()
     context = Context.open(settings)
-    metrics = Metrics(context.database)
+    metrics = Metrics(context.database, settings)
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -22,6 +22,7 @@ from service.api.http.event_streams import EventStream
 from service.api.http.paging import MAX_CURSOR_CHARACTERS, MAX_LIMIT
 from service.api.http.query_parameters import refuse_unknown_parameters
 from service.api.http.request_bodies import request_sha256
+from service.api.middleware.request_log import PROJECT
 from service.database.tables import Job
 from service.domain import jobs
 from service.domain.idempotency import Answer, once
@@ -75,6 +76,7 @@ class _ApiKey(HTTPBearer):
                 remedy="Send 'Authorization: Bearer KEY' with a key made by 'mrasfm keys create'.",
                 headers={"WWW-Authenticate": 'Bearer realm="mrasfm"'},
             )
+        request.scope[PROJECT] = project_id
         refuse_unknown_parameters(request)  # not before: a key in the address is none, and answered as that
         return Caller(project_id)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import shutil
+from collections.abc import Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -13,18 +15,28 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from schemas.api.jobs import JobKind
 from schemas.api.webhooks import DeliveryState
 from service.database.connections import Database, clock_us
 from service.database.tables import Job, JobState, Project, WebhookDelivery, WorkerSeen
+from service.domain import jobs, passes
 from service.domain.workers import ONLINE_US
+from service.settings import Settings
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+
+
+class DiskUsage(NamedTuple):
+    """Space of a file system."""
+
+    total_bytes: int
+    free_bytes: int
 
 
 class Metrics:
     """Counts requests, and reads the rest from the database."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, settings: Settings) -> None:
         self.registry = CollectorRegistry()
         self.requests = Counter(
             "mrasfm_http_requests", "HTTP requests", ["method", "route", "status"], registry=self.registry
@@ -37,11 +49,13 @@ class Metrics:
             registry=self.registry,
         )
         self.received_bytes = Counter("mrasfm_received_bytes", "Bytes of request bodies", registry=self.registry)
+        self.sent_bytes = Counter("mrasfm_sent_bytes", "Bytes of bodies of answers", registry=self.registry)
         self._told = self.registry
         if os.environ.get("PROMETHEUS_MULTIPROC_DIR"):  # what prometheus_client itself goes by
             self._told = CollectorRegistry()
             MultiProcessCollector(self._told)  # type: ignore[no-untyped-call]
-        self._told.register(_Records(database))
+        self._told.register(_Records(database, settings))
+        self._told.register(_Disk(settings))
 
     def text(self) -> bytes:
         """All metrics in Prometheus' text format, of all processes of this API."""
@@ -49,8 +63,9 @@ class Metrics:
 
 
 class _Records(Collector):
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, settings: Settings) -> None:
         self._database = database
+        self._settings = settings
 
     def describe(self) -> Iterator[Metric]:
         """Nothing: else registering would ask the database."""
@@ -59,31 +74,65 @@ class _Records(Collector):
     def collect(self) -> Iterator[Metric]:
         """Counts of what is recorded; without a database, only that it does not answer."""
         try:
-            states, messages, workers, used = self._counts()
+            with self._database.read() as session:
+                found = list(self._recorded(session))
         except SQLAlchemyError:
             yield GaugeMetricFamily("mrasfm_database_up", "Whether the database answers", value=0)
             return
         yield GaugeMetricFamily("mrasfm_database_up", "Whether the database answers", value=1)
-        jobs = GaugeMetricFamily("mrasfm_jobs", "Jobs by state", labels=["state"])
-        for state in JobState:
-            jobs.add_metric([state], states.get(state, 0))
-        yield jobs
-        webhooks = GaugeMetricFamily(
-            "mrasfm_webhook_messages", "Messages of webhooks by state, of the last month", labels=["state"]
-        )
-        for message_state in DeliveryState:
-            webhooks.add_metric([message_state], messages.get(message_state, 0))
-        yield webhooks
-        yield GaugeMetricFamily("mrasfm_workers_online", "Workers that reported lately", value=workers)
-        yield GaugeMetricFamily("mrasfm_stored_bytes", "Bytes in the artifact store", value=used)
+        yield from found
 
-    def _counts(self) -> tuple[dict[str, int], dict[str, int], int, int]:
-        with self._database.read() as session:
-            states, messages = _by_state(session, Job.state), _by_state(session, WebhookDelivery.state)
-            seen = WorkerSeen.seen_us > clock_us(session) - ONLINE_US
-            workers = session.scalar(select(func.count()).select_from(WorkerSeen).where(seen)) or 0
-            used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0
-        return states, messages, workers, int(used)
+    def _recorded(self, session: Session) -> Iterator[Metric]:
+        now = clock_us(session)
+        yield _family("jobs", "Jobs by state", "state", _by_state(session, Job.state), names=JobState)
+        stalled = jobs.count_stalled(session, heard_before_us=now - int(self._settings.stalled_seconds * 1e6))
+        yield _gauge("jobs_stalled", "Running jobs without a recent heartbeat", stalled)
+        backlogs = jobs.backlogs(session)
+        due = {str(kind): backlog.jobs for kind, backlog in backlogs.items()}
+        yield _family("jobs_due", "Jobs that wait for nothing but a worker, by kind", "kind", due, names=JobKind)
+        waits_s = {str(kind): max(0, now - backlog.since_us) / 1e6 for kind, backlog in backlogs.items()}
+        about = "Time for which the oldest of them has waited"
+        yield _family("jobs_due_longest_wait_seconds", about, "kind", waits_s, names=JobKind)
+        messages = _by_state(session, WebhookDelivery.state)
+        about = "Messages of webhooks by state, of the last month"
+        yield _family("webhook_messages", about, "state", messages, names=DeliveryState)
+        online = select(func.count()).select_from(WorkerSeen).where(WorkerSeen.seen_us > now - ONLINE_US)
+        yield _gauge("workers_online", "Workers that reported lately", session.scalar(online) or 0)
+        ages_s = {name: max(0, now - done_us) / 1e6 for name, done_us in passes.last_us(session).items()}
+        about = "Time since a reconciler last made each of its passes"
+        yield _family("reconciler_pass_age_seconds", about, "pass", ages_s, names=ages_s)
+        used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0
+        yield _gauge("stored_bytes", "Bytes in the artifact store", int(used))
+
+
+class _Disk(Collector):
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    def collect(self) -> Iterator[Metric]:
+        """Space where uploads are received."""
+        usage = disk_of_uploads(self._settings)
+        yield _gauge("disk_free_bytes", "Free space where uploads are received", usage.free_bytes)
+        yield _gauge("disk_total_bytes", "Size of the file system where uploads are received", usage.total_bytes)
+
+
+def disk_of_uploads(settings: Settings) -> DiskUsage:
+    """Space where uploads are received."""
+    settings.spool_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
+    total_bytes, _, free_bytes = shutil.disk_usage(settings.spool_dir)
+    return DiskUsage(total_bytes, free_bytes)
+
+
+def _gauge(name: str, about: str, value: float) -> Metric:
+    return GaugeMetricFamily(f"mrasfm_{name}", about, value=value)
+
+
+def _family(name: str, about: str, label: str, values: Mapping[str, float], *, names: Iterable[str]) -> Metric:
+    """A metric with a value for each of the names, and 0 where there is none."""
+    result = GaugeMetricFamily(f"mrasfm_{name}", about, labels=[label])
+    for key in names:
+        result.add_metric([key], values.get(key, 0))
+    return result
 
 
 def _by_state(session: Session, state: InstrumentedAttribute[str]) -> dict[str, int]:

@@ -11,7 +11,19 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from sqlalchemy import Engine, ExceptionContext, create_engine, event, inspect, text
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Engine,
+    ExceptionContext,
+    create_engine,
+    event,
+    inspect,
+    literal,
+    literal_column,
+    select,
+    text,
+)
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session, sessionmaker
@@ -28,6 +40,7 @@ MIGRATIONS = Path(__file__).parent / "migrations"
 # PostgreSQL ended this transaction for another one's sake: a serialization failure, a deadlock.
 _TRY_AGAIN = frozenset({"40001", "40P01"})
 _READ_ONLY = "25006"
+_CLOCK_US = literal_column("CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)", BigInteger)
 LOCK_TIMEOUT = "55P03"
 MAX_ATTEMPTS = 5  # of one transaction
 WAIT_S = 0.05  # at most, before the second; twice as long before each later one
@@ -135,9 +148,18 @@ def clock_us(session: Session) -> int:
     What one machine notes and another compares, as the end of a lease, is taken from here: their own clocks differ.
     SQLite's users share a machine.
     """
-    if session.get_bind().dialect.name == "sqlite":
+    if _is_embedded(session):
         return now_us()
-    return int(session.scalars(text("SELECT CAST(extract(epoch FROM clock_timestamp()) * 1000000 AS bigint)")).one())
+    return session.scalars(select(_CLOCK_US)).one()
+
+
+def clock_expression(session: Session) -> ColumnElement[int]:
+    """The same as a part of a statement that writes, which asks nothing of its own."""
+    return literal(now_us(), BigInteger) if _is_embedded(session) else _CLOCK_US
+
+
+def _is_embedded(session: Session) -> bool:
+    return session.get_bind().dialect.name == "sqlite"
 
 
 def _server(url: str, timeout_s: float) -> Engine:

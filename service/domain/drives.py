@@ -14,6 +14,7 @@ from schemas.api.jobs import JobKind
 from schemas.api.problems import ProblemItem
 from schemas.file_names import MANIFEST_NAME, composed
 from service.database import bulk
+from service.database.connections import clock_expression
 from service.database.tables import Blob, Drive, DriveFile, Job, Project, new_id, now_us
 from service.domain import drive_files, jobs
 from service.domain.access import require
@@ -207,7 +208,7 @@ def known_files(session: Session, project_id: str, digests: Sequence[str]) -> di
         blobs.lock_project(session, project_id)
     for i in range(0, len(digests), _BATCH):
         some = (Blob.project_id == project_id) & Blob.sha256.in_(digests[i : i + _BATCH]) & blobs.is_drive_file()
-        session.execute(update(Blob).where(some).values(touched_us=now_us()))
+        session.execute(update(Blob).where(some).values(touched_us=clock_expression(session)))
         found.update((blob.sha256, blob) for blob in session.scalars(select(Blob).where(some)))
     return found
 

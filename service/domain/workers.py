@@ -31,6 +31,11 @@ def report(session: Session, *, name: str, queues: Sequence[str], concurrency: i
         row.queues, row.concurrency, row.seen_us = ",".join(queues), concurrency, now
 
 
+def leave(session: Session, name: str) -> None:
+    """Drop a worker that was told to stop: it takes no jobs any more, and nobody has to look after it."""
+    session.execute(delete(WorkerSeen).where(WorkerSeen.name == name))
+
+
 def forget(session: Session, *, unseen_since_us: int) -> None:
     """Drop workers that have not been seen for long."""
     session.execute(delete(WorkerSeen).where(WorkerSeen.seen_us < unseen_since_us))

@@ -12,8 +12,8 @@ from typing import Any
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.orm import Session
 
-from service.database.connections import Database
-from service.database.tables import Blob, now_us
+from service.database.connections import Database, clock_us
+from service.database.tables import Blob
 from service.storage import blobs
 from service.storage.artifacts import ArtifactStore
 from service.storage.durability import boot_id
@@ -173,7 +173,7 @@ class BlobWriter:
         """
         found: dict[str, blobs.Recorded] = {}
         # Not the block's begin: the bytes may have taken longer than unused ones are kept.
-        self._recorded_us = now_us()
+        self._recorded_us = self._database.query(clock_us)
         unlike = list({file.sha256: file for file in files}.values())
         for i in range(0, len(unlike), _BATCH):
             contents = [file.identity for file in unlike[i : i + _BATCH]]

@@ -14,7 +14,7 @@ from sqlalchemy import exists as sql_exists
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.orm import Session, aliased
 
-from service.database.connections import Database
+from service.database.connections import Database, clock_expression, clock_us
 from service.database.tables import (
     Blob,
     Checkpoint,
@@ -26,7 +26,6 @@ from service.database.tables import (
     Project,
     SceneFile,
     new_id,
-    now_us,
 )
 from service.errors import QuotaFull, ServiceError, StorageChanged
 
@@ -107,7 +106,7 @@ def find(session: Session, project_id: str, sha256: str) -> Blob | None:
     """The project's blob of this content, kept from being collected for a while."""
     blob = session.scalar(select(Blob).where(Blob.project_id == project_id, Blob.sha256 == sha256))
     if blob is not None:
-        session.execute(update(Blob).where(Blob.id == blob.id).values(touched_us=now_us()))
+        session.execute(update(Blob).where(Blob.id == blob.id).values(touched_us=clock_expression(session)))
     return blob
 
 
@@ -147,7 +146,7 @@ def record(
     if not is_new:
         return _recorded_before(session, project_id, sha256)
     content = {"sha256": sha256, "size_bytes": size_bytes, "key": key, "written_in_boot": written_in_boot}
-    row = _row(project_id, content, now_us())
+    row = _row(project_id, content, clock_us(session))
     if connection.execute(_INSERT[connection.dialect.name], row).first() is not None:
         _take_space(session, project_id, size_bytes, within_quota=within_quota)
         return Recorded(id=row["id"], key=key, size_bytes=size_bytes)
@@ -185,7 +184,8 @@ def record_all(
     known = (Blob.project_id == project_id) & Blob.sha256.in_(
         row["sha256"] for row in rows if row["id"] not in inserted
     )
-    session.execute(update(Blob).where(known).values(touched_us=now_us()).execution_options(synchronize_session=False))
+    touched = update(Blob).where(known).values(touched_us=clock_expression(session))
+    session.execute(touched.execution_options(synchronize_session=False))
     for blob in session.scalars(select(Blob).where(known)):
         recorded[blob.sha256] = Recorded(id=blob.id, key=blob.key, size_bytes=blob.size_bytes)
     return recorded

@@ -9,7 +9,7 @@ from itertools import islice
 
 from sqlalchemy import select
 
-from service.database.connections import Database
+from service.database.connections import Database, clock_us
 from service.database.tables import Project, now_us
 from service.storage import blobs
 from service.storage.artifacts import ArtifactStore
@@ -50,8 +50,8 @@ def _collect_unused_of(database: Database, artifacts: ArtifactStore, project_id:
     deleted = 0
     last: str | None = ""
     while last is not None:
-        since_us = now_us() - _GRACE_US
         with database.read() as session:
+            since_us = clock_us(session) - _GRACE_US
             page = blobs.find_unused(
                 session, project_id, untouched_since_us=since_us, after_sha256=last, look_at=_LOOKED_AT
             )
@@ -70,7 +70,7 @@ def collect_named(database: Database, artifacts: ArtifactStore, blob_ids: Collec
     int
         How many objects were deleted.
     """
-    deleted, since_us, left = 0, now_us() - _GRACE_US, iter(sorted(blob_ids))
+    deleted, since_us, left = 0, database.query(clock_us) - _GRACE_US, iter(sorted(blob_ids))
     while some := list(islice(left, _BATCH)):
         with database.read() as session:
             found = blobs.unused_among(session, some, untouched_since_us=since_us)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -333,7 +333,7 @@ def test_files_that_take_longer_than_the_grace_are_recorded(
     """Nothing refers to them yet, and they count as just used all the same."""
     writer = SpoolWriter(database_settings.spool_dir, min_free_bytes=0)
     with monkeypatch.context() as earlier:
-        earlier.setattr(blob_writer, "now_us", lambda: now_us() - _TWO_HOURS_US)
+        earlier.setattr(blob_writer, "clock_us", lambda session: now_us() - _TWO_HOURS_US)
         begun = BlobWriter(database, artifacts, project_id=project_id, durable=False)
         stored = begun.store_all([writer.finish(b"bytes")])
     with begun as store:
@@ -342,6 +342,32 @@ def test_files_that_take_longer_than_the_grace_are_recorded(
         store.used()
     with database.read() as session:
         assert session.scalars(select(Blob.key)).all() == [stored[0].key]
+
+
+@pytest.mark.parametrize("off_us", [_TWO_HOURS_US, -_TWO_HOURS_US])
+def test_what_was_just_used_is_told_by_the_database_s_clock(
+    postgres_api: Api, set_clock: Callable[[int], None], off_us: int
+) -> None:
+    """A host whose clock is off would delete what another is about to refer to."""
+    database, artifacts = postgres_api.context.database, postgres_api.context.artifacts
+    client = postgres_api.client()
+
+    def keep(data: bytes) -> str:
+        spooled = SpoolWriter(postgres_api.context.settings.spool_dir, min_free_bytes=0).finish(data)
+        with BlobWriter(database, artifacts, project_id=client.project_id, durable=False) as store:
+            stored = store.store_all([spooled])
+            (recorded,) = store.record(stored).values()
+            store.used()
+        return recorded.id
+
+    for of_writer, of_collector in ((off_us, 0), (0, off_us)):
+        set_clock(of_writer)
+        kept = {keep(f"{of_writer} {k}".encode()) for k in range(2)}
+        set_clock(of_collector)
+        collect_unused(database, artifacts, project_id=client.project_id)
+        set_clock(0)
+        with database.read() as session:
+            assert kept <= set(session.scalars(select(Blob.id).where(Blob.project_id == client.project_id)))
 
 
 def test_an_object_whose_recording_has_no_answer_stays(

@@ -208,6 +208,38 @@ def test_connections_that_ask_nothing_end(start_api: StartApi, monkeypatch: pyte
         assert b"HTTP/1.1 408 " in everything_from(second)
 
 
+def bytes_sent(caplog: pytest.LogCaptureFixture, route: str) -> list[int]:
+    """By the request log, of every answer of a route that has ended."""
+    fields = [getattr(record, "fields", {}) for record in caplog.records]
+    return [noted["sent_bytes"] for noted in fields if noted.get("route") == route]
+
+
+def test_an_answer_that_nobody_takes_ends(
+    start_api: StartApi, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its connection, its file and what was read of it were held for ever."""
+    monkeypatch.setattr(protocol, "UNTAKEN_WITHIN_S", 1.0)
+    api, size = start_api(), 24_000_000
+    client = api.client()
+    scene_id = client.scene({"points.ply": bytes(size)})
+    route = "/v1/scenes/{scene_id}/files/{path:path}"
+    asked = (
+        f"GET /v1/scenes/{scene_id}/files/points.ply HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {client.key}\r\n\r\n"
+    )
+    with caplog.at_level("INFO", logger="mrasfm.api"):
+        with connected(api) as connection:
+            connection.sendall(asked.encode())
+            received = 0
+            while received < size:  # as slowly as it likes
+                received += len(connection.recv(2_000_000))
+                time.sleep(0.1)
+        wait_until(lambda: bytes_sent(caplog, route) == [size], "the answer that was taken")
+        with connected(api) as connection:
+            connection.sendall(asked.encode())
+            wait_until(lambda: len(bytes_sent(caplog, route)) == 2, "the end of the other one")
+    assert bytes_sent(caplog, route)[1] < size
+
+
 @pytest.mark.parametrize("target", [f"files/{NAME}", "archive", "files:declare"])
 def test_a_body_that_stops_coming_ends(start_api: StartApi, target: str) -> None:
     api = start_api(upload_idle_seconds=0.3)

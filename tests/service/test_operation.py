@@ -15,15 +15,15 @@ from typing import Any
 import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from sqlalchemy import event, insert, text
+from sqlalchemy import event, insert, text, update
 
 from schemas.api.jobs import JobKind
 from service.api.routes import drives as drive_routes
-from service.database.tables import Job, WorkerSeen, new_id
-from service.domain import workers
+from service.database.tables import Job, Pass, WorkerSeen, new_id, now_us
+from service.domain import passes, workers
 from service.logs import JsonFormatter, log_fields
 from service.settings import Settings
-from tests.helpers.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of
+from tests.helpers.live_api import HOST, Api, Client, api_in_thread, free_port, problem_of, wait_until
 from tests.helpers.sqlite_steps import sqlite_steps
 from tests.helpers.tiny_drive import tiny_drive
 from tests.service.conftest import StartApi
@@ -175,6 +175,79 @@ def test_the_status_says_what_is_missing_and_what_that_means(api: Api, client: C
     (worker,) = (worker for worker in shown["workers"] if worker["name"] == "w@test")
     assert worker["online"] is True
     assert not any("no worker" in reason for reason in shown["reasons"])
+
+
+def test_the_status_tells_of_the_reconciler(start_api: StartApi) -> None:
+    """Without one all else goes on, and what goes wrong stays so."""
+    api = start_api(reconcile_seconds=30.0)
+    client = api.client()
+
+    def told() -> tuple[bool, bool]:
+        shown = client.get("/v1/status").json()
+        return shown["reconciler"], any("no reconciler" in reason for reason in shown["reasons"])
+
+    assert told() == (False, True)
+    assert not any("reconciler_pass" in name for name in metrics_of(api))
+    with api.database.write() as session:
+        passes.note(session, passes.JOBS)
+    assert told() == (True, False)
+    assert 0 <= metrics_of(api)['mrasfm_reconciler_pass_age_seconds{"pass": "jobs"}'] < 60
+    with api.database.write() as session:
+        session.get_one(Pass, passes.JOBS).done_us -= 80_000_000
+    assert told() == (True, False), "it is busy for a while"
+    with api.database.write() as session:
+        session.get_one(Pass, passes.JOBS).done_us -= 20_000_000
+    assert told() == (False, True)
+    assert metrics_of(api)['mrasfm_reconciler_pass_age_seconds{"pass": "jobs"}'] > 99
+
+
+def test_how_long_jobs_have_waited_for_a_worker(start_api: StartApi) -> None:
+    api = start_api()
+    client = api.client()
+
+    def waits_s() -> tuple[float, dict[str, float]]:
+        metrics, kinds = metrics_of(api), ("RECONSTRUCTION", "PREFLIGHT")
+        by_kind = {kind: metrics[f'mrasfm_jobs_due_longest_wait_seconds{{"kind": "{kind}"}}'] for kind in kinds}
+        return client.get("/v1/status").json()["queue"]["longest_wait_seconds"], by_kind
+
+    def set_job(**values: Any) -> None:
+        with api.database.write() as session:
+            session.execute(update(Job).where(Job.id == job_id).values(values))
+
+    assert waits_s() == (0.0, {"RECONSTRUCTION": 0.0, "PREFLIGHT": 0.0})
+    job_id = client.reconstruct(client.committed())["id"]
+    now = now_us()
+    set_job(created_us=now - 900_000_000)
+    longest_s, by_kind = waits_s()
+    assert 900 <= longest_s < 960
+    assert 900 <= by_kind["RECONSTRUCTION"] < 960
+    assert by_kind["PREFLIGHT"] < 60
+    assert metrics_of(api)['mrasfm_jobs_due{"kind": "RECONSTRUCTION"}'] == 1
+    set_job(not_before_us=now - 300_000_000)
+    assert 300 <= waits_s()[0] < 360, "before, it waited for something else"
+    set_job(not_before_us=now + 300_000_000)
+    assert waits_s()[0] < 60, "it waits for its time"
+    set_job(not_before_us=0, waiting_for=1)
+    assert waits_s()[0] < 60, "it waits for another job"
+    set_job(waiting_for=0, state="RUNNING", heartbeat_us=now - 3_600_000_000)
+    assert waits_s()[0] < 60
+    assert metrics_of(api)["mrasfm_jobs_stalled{}"] == 1
+
+
+def test_the_request_log_says_who_and_how_much(api: Api, client: Client, caplog: pytest.LogCaptureFixture) -> None:
+    drive = tiny_drive()
+    with caplog.at_level("INFO", logger="mrasfm.api"):
+        created = client.post("/v1/drives", content=drive.raw)
+        httpx.get(f"{api.url}/v1/drives")
+        wait_until(lambda: len(requests_in(caplog)) == 2, "both lines")
+    known, unknown = requests_in(caplog)
+    assert (known["project"], known["client"]) == (client.project_id, HOST)
+    assert (known["received_bytes"], known["sent_bytes"]) == (len(drive.raw), len(created.content))
+    assert (unknown["status"], unknown["project"]) == (401, None)
+
+
+def requests_in(caplog: pytest.LogCaptureFixture) -> list[dict[str, Any]]:
+    return [record.fields for record in caplog.records if record.getMessage() == "request"]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("off_us", [3_600_000_000, -3_600_000_000])

@@ -13,9 +13,10 @@ from pathlib import Path
 import psutil
 import pytest
 from pydantic import SecretStr
+from sqlalchemy import select
 
 from schemas.api.problems import PROBLEM_TYPE
-from service.database.tables import Blob, Checkpoint, SceneFile
+from service.database.tables import Blob, Checkpoint, SceneFile, WorkerSeen
 from service.job_queue import JobQueue
 from service.settings import Settings
 from tests.helpers.service_world import SHORT_TIMES, World, environment_of, is_gone, kill, wait_until
@@ -76,8 +77,15 @@ def test_worker_is_killed(world: World, brief_drive: Path, tmp_path: Path) -> No
     stages = {stage["stage"]: stage["reused"] for stage in report_of(world)["stages"]}
     assert stages["features"] is True
     assert stages["refinement"] is False
+    online = known_workers(world)
     second.terminate()
     second.wait(60)
+    assert len(known_workers(world)) == len(online) - 1, "one that was told to stop is not missed"
+
+
+def known_workers(world: World) -> set[str]:
+    with world.database.read() as session:
+        return set(session.scalars(select(WorkerSeen.name)))
 
 
 @pytest.mark.slow

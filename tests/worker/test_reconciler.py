@@ -15,7 +15,7 @@ from sqlalchemy import insert, update
 
 import worker.reconciler
 from service.database.tables import Blob, Drive, IdempotencyKey, Job, JobEvent, Project, Scene, new_id, now_us
-from service.domain import jobs
+from service.domain import exports, jobs, passes
 from service.job_queue import QUEUES, JobQueue
 from service.storage import garbage_collection
 from service.storage.blob_writer import file_sha256, store_file
@@ -112,12 +112,36 @@ def test_jobs_do_not_wait_for_the_sweep(world: World, brief_drive: Path, monkeyp
             assert jobs.claim(session, job_id, owner="a worker", lease_us=0)
         wait_until(lambda: queued(world) == 1, "the job's message")
         assert not listed.is_set(), "the store is not listed with every start"
+        wait_until(lambda: passes_of(world) == {passes.JOBS, passes.WEBHOOKS}, "what the status asks for")
     finally:
         ended.set()
         thread.join(60)
         stopped = not thread.is_alive()
         go_on.set()
     assert stopped
+
+
+def passes_of(world: World) -> set[str]:
+    """Passes that have been noted: those that went well."""
+    with world.database.read() as session:
+        return set(passes.last_us(session))
+
+
+def test_a_pass_that_fails_is_not_noted(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*given: object, **more: object) -> None:
+        raise OSError
+
+    reconciler, ended = Reconciler(world.settings), threading.Event()
+    monkeypatch.setattr(exports, "forget_expired", fails)
+    monkeypatch.setattr(reconciler, "reconcile_jobs", fails)
+    thread = threading.Thread(target=reconciler.run, args=(ended,))
+    thread.start()
+    try:
+        wait_until(lambda: passes.WEBHOOKS in passes_of(world), "the pass that goes well")
+    finally:
+        ended.set()
+        thread.join(60)
+    assert passes_of(world) == {passes.WEBHOOKS}
 
 
 def test_delivered_message_is_not_sent_again(world: World, brief_drive: Path) -> None:
@@ -252,7 +276,7 @@ def test_objects_that_no_record_names(world: World, brief_drive: Path, monkeypat
     monkeypatch.setattr(garbage_collection, "now_us", tomorrow)
     reconciler.collect_orphans()
     assert unnamed in objects(world), "the store was listed within the day, maybe by a process that is gone"
-    monkeypatch.setattr(worker.reconciler, "now_us", tomorrow)
+    monkeypatch.setattr(worker.reconciler, "clock_us", lambda session: tomorrow())
     reconciler.collect_orphans()
     assert objects(world) == named
     assert world.drive(drive_id).state == "COMMITTED"

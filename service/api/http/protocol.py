@@ -7,6 +7,7 @@ could fill the memory of the process. Nor does it end connections that never mak
 from __future__ import annotations
 
 import asyncio
+import socket
 from typing import TYPE_CHECKING, cast
 
 from starlette.responses import Response
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 
 MAX_HEAD_BYTES = 64_000
 HEAD_WITHIN_S = 30.0
+UNTAKEN_WITHIN_S = 120.0  # for so long a client may take nothing of what is sent to it
 # Chunks of a body come with their lengths, and may come with signatures.
 _FRAME_BYTES = 256
 
@@ -47,6 +49,10 @@ class BoundedHttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Extend uvicorn's method of this name."""
         super().connection_made(transport)
+        if hasattr(socket, "TCP_USER_TIMEOUT"):  # on Linux
+            # Without it an answer that nobody takes would be held for ever, with its file and what was read of it.
+            raw = transport.get_extra_info("socket")
+            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNTAKEN_WITHIN_S))
         self._wait_for_head()
 
     def connection_lost(self, exc: Exception | None) -> None:

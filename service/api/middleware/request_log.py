@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from starlette.datastructures import MutableHeaders
 from starlette.responses import Response
@@ -15,6 +15,8 @@ from service.database.tables import new_id
 from service.logs import log_fields
 
 log = logging.getLogger("mrasfm.api")
+
+PROJECT = "mrasfm.project"  # in the scope of a request whose key or session is valid
 
 
 class RequestLog:
@@ -36,7 +38,7 @@ class RequestLog:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        request_id, started_s, status, received_bytes = new_id("req"), time.perf_counter(), 0, 0
+        request_id, started_s, status, received_bytes, sent_bytes = new_id("req"), time.perf_counter(), 0, 0, 0
         is_stream = False
 
         async def counted_receive() -> Message:
@@ -46,12 +48,13 @@ class RequestLog:
             return message
 
         async def send_with_id(message: Message) -> None:
-            nonlocal status, is_stream
+            nonlocal status, sent_bytes, is_stream
             if message["type"] == "http.response.start":
                 status, headers = message["status"], MutableHeaders(scope=message)
                 is_stream = headers.get("content-type", "").startswith("text/event-stream")
                 headers["X-Request-Id"] = request_id
             await send(message)
+            sent_bytes += len(message.get("body", b""))
 
         with log_fields(request_id=request_id):
             try:
@@ -63,13 +66,27 @@ class RequestLog:
                 await self._failed()(scope, counted_receive, send_with_id)
             finally:
                 self._metrics.received_bytes.inc(received_bytes)
-                self._note(scope, status, time.perf_counter() - started_s, is_stream=is_stream)
+                self._metrics.sent_bytes.inc(sent_bytes)
+                transferred = {"received_bytes": received_bytes, "sent_bytes": sent_bytes}
+                self._note(scope, status, time.perf_counter() - started_s, transferred, is_stream=is_stream)
 
-    def _note(self, scope: Scope, status: int, elapsed_s: float, *, is_stream: bool) -> None:
+    def _note(
+        self, scope: Scope, status: int, elapsed_s: float, transferred: Mapping[str, int], *, is_stream: bool
+    ) -> None:
         # The route, not the path, is a label: paths are as many as files.
         route = getattr(scope.get("route"), "path", "none")
         self._metrics.requests.labels(scope["method"], route, status).inc()
         if not is_stream:  # how long somebody listened is no time to answer
             self._metrics.seconds.labels(scope["method"], route).observe(elapsed_s)
-        fields = {"method": scope["method"], "route": route, "path": scope["path"], "status": status}
-        log.info("request", extra={"fields": {**fields, "seconds": round(elapsed_s, 4)}})
+        client = scope.get("client") or (None, None)  # of a socket in the file system there is none
+        fields = {
+            "method": scope["method"],
+            "route": route,
+            "path": scope["path"],
+            "status": status,
+            "project": scope.get(PROJECT),
+            "client": client[0],
+            **transferred,
+            "seconds": round(elapsed_s, 4),
+        }
+        log.info("request", extra={"fields": fields})

@@ -17,7 +17,8 @@ from service.api.credentials import secret_of
 from service.api.dependencies import CallerDep, ContextDep, LastEventId, StreamDep
 from service.api.http.responses import gives, problems
 from service.api.routes.job_views import count_shown_together, stalled_before_us, views_of
-from service.database.tables import Job, JobEvent, JobMember, JobState, now_us
+from service.database.connections import clock_us
+from service.database.tables import Job, JobEvent, JobMember, JobState
 from service.domain.keys import KeyRing
 
 router = APIRouter(prefix="/v1/events", tags=["jobs"])
@@ -66,7 +67,7 @@ class _Reader:
     def begin(self, last_event_id: int | None) -> _Position:
         """The position after an event; without one, that after all events there are."""
         with self.context.database.read() as session:
-            final = JobEvent.created_us < now_us() - _OVERLAP_US
+            final = JobEvent.created_us < clock_us(session) - _OVERLAP_US
             newest = session.scalar(select(JobEvent.id).where(final).order_by(JobEvent.id.desc()).limit(1)) or 0
             if last_event_id is not None:
                 return _Position(min(last_event_id, newest))
@@ -117,7 +118,7 @@ class _Reader:
             .order_by(JobEvent.id)
             .limit(_EVENTS_AT_ONCE)
         )
-        changed, final_before_us, is_final = set[str](), now_us() - _OVERLAP_US, True
+        changed, final_before_us, is_final = set[str](), clock_us(session) - _OVERLAP_US, True
         for event_id, job_id, created_us in session.execute(statement).all():
             if event_id not in position.sent:
                 changed.add(job_id)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import shutil
 from importlib.metadata import version
 
 from fastapi import APIRouter, Depends, Request, Response
@@ -17,11 +16,12 @@ from schemas.api.status import DiskStatus, Health, QueueStatus, Ready, ServiceSt
 from service.api.context import Context
 from service.api.dependencies import CallerDep, ContextDep, moment
 from service.api.http.responses import gives, problems
-from service.api.metrics import CONTENT_TYPE, Metrics
+from service.api.metrics import CONTENT_TYPE, Metrics, disk_of_uploads
 from service.api.readiness import Readiness
 from service.api.routes.job_views import stalled_before_us
 from service.database.connections import clock_us
 from service.database.tables import Job, JobState, WorkerSeen
+from service.domain import jobs, passes
 from service.domain.workers import ONLINE_US
 from service.errors import Unauthorized
 from service.job_queue import QUEUES, BrokerError
@@ -56,6 +56,12 @@ def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
         reasons.append("the broker does not answer: jobs are accepted and start when it is back")
     with context.database.read() as session:
         workers, queue = _workers(session), _queue(session, context)
+        reconciler = passes.are_made(session, every_s=context.settings.reconcile_seconds)
+    if not reconciler:
+        reasons.append(
+            "no reconciler looks after the jobs: those whose worker died stay with it, those whose message was lost "
+            "wait, and nothing is sent to webhooks or deleted"
+        )
     served = {name for worker in workers if worker.online for name in worker.queues}
     for name in dict.fromkeys(QUEUES.values()):
         if name not in served:
@@ -69,6 +75,7 @@ def get_status(caller: CallerDep, context: ContextDep) -> ServiceStatus:
         reasons=reasons,
         version=version("mrasfm"),
         broker=broker,
+        reconciler=reconciler,
         workers=workers,
         queue=queue,
         disk=disk,
@@ -95,26 +102,25 @@ def _workers(session: Session) -> list[WorkerStatus]:
 
 
 def _queue(session: Session, context: Context) -> QueueStatus:
-    silent = Job.heartbeat_us < stalled_before_us(session, context.settings)
     # Of these alone, which an index finds: those that have ended become hundreds of thousands.
     waiting = Job.state.in_((JobState.QUEUED, JobState.RUNNING))
     by_state = select(Job.state, func.count()).where(waiting).group_by(Job.state)
     counts: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
-    stalled = select(func.count()).select_from(Job).where(Job.state == JobState.RUNNING, silent)
+    waits_us = [clock_us(session) - backlog.since_us for backlog in jobs.backlogs(session).values()]
     return QueueStatus(
         queued=counts.get(JobState.QUEUED, 0),
         running=counts.get(JobState.RUNNING, 0),
-        stalled=session.scalar(stalled) or 0,
+        stalled=jobs.count_stalled(session, heard_before_us=stalled_before_us(session, context.settings)),
+        longest_wait_seconds=max([0, *waits_us]) / 1e6,
     )
 
 
 def _disk(context: Context) -> DiskStatus:
-    context.settings.spool_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-    usage = shutil.disk_usage(context.settings.spool_dir)
+    usage = disk_of_uploads(context.settings)
     return DiskStatus(
-        free_bytes=usage.free,
-        total_bytes=usage.total,
-        accepts_uploads=usage.free > context.settings.min_free_disk_bytes,
+        free_bytes=usage.free_bytes,
+        total_bytes=usage.total_bytes,
+        accepts_uploads=usage.free_bytes > context.settings.min_free_disk_bytes,
     )
 
 

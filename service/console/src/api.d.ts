@@ -389,6 +389,7 @@ export interface components {
             queued: number;
             running: number;
             stalled: number;
+            longest_wait_seconds: number;
         };
         /** @enum {string} */
         ReadoutDirection: "top_to_bottom" | "bottom_to_top" | "left_to_right" | "right_to_left";
@@ -472,6 +473,7 @@ export interface components {
             reasons: string[];
             version: string;
             broker: boolean;
+            reconciler: boolean;
             workers: components["schemas"]["WorkerStatus"][];
             queue: components["schemas"]["QueueStatus"];
             disk: components["schemas"]["DiskStatus"];

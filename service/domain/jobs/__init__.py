@@ -26,7 +26,7 @@ from service.domain.jobs._leases import (
 )
 from service.domain.jobs._planning import SubmapPlace, wait_for_submaps
 from service.domain.jobs._queries import Claim, FencedError, active_of_drive, events_after
-from service.domain.jobs._queue import all_due, due, due_after, mark_enqueued
+from service.domain.jobs._queue import all_due, backlogs, count_stalled, due, due_after, mark_enqueued
 from service.domain.jobs._requests import (
     OfTree,
     cancel_orphan,
@@ -53,6 +53,7 @@ __all__ = [
     "SubmapPlace",
     "active_of_drive",
     "all_due",
+    "backlogs",
     "blame_of_loss",
     "bound_times",
     "cancel_orphan",
@@ -60,6 +61,7 @@ __all__ = [
     "cancelled",
     "children_of",
     "claim",
+    "count_stalled",
     "create",
     "due",
     "due_after",

@@ -121,7 +121,7 @@ def release(session: Session, held: Claim) -> None:
     if locked(session, held.job_id).cancel_requested_us is not None:
         cancelled(session, held)
         return
-    requeue(session, held, "released", None, not_before_us=0, values={})
+    requeue(session, held, "released", None, not_before_us=clock_us(session), values={})
 
 
 def record_findings(session: Session, held: Claim, findings: Sequence[Mapping[str, Any]], *, sound: bool) -> None:

@@ -15,6 +15,7 @@ from sqlalchemy.orm import Session, load_only
 
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
+from service.database.connections import clock_us
 from service.database.tables import TERMINAL, Job, JobMember, JobState, now_us
 from service.domain.jobs._queries import ACTIVE, change, tell_progress, tell_state
 
@@ -58,8 +59,13 @@ def look_at(session: Session, parent_id: str) -> None:
         if change(session, parent_id, WAITS, ended):
             tell_state(session, parent_id)
         return
-    if change(session, parent_id, WAITS, {"waiting_for": left}):
+    if change(session, parent_id, WAITS, waiting_for(session, left)):
         _tell(session, parent_id)
+
+
+def waiting_for(session: Session, left: int) -> dict[str, Any]:
+    """Values of a job that waits for so many others; where it waits for none, it may begin from now on."""
+    return {"waiting_for": left} if left else {"waiting_for": 0, "not_before_us": clock_us(session)}
 
 
 def _hopeless(session: Session, parent: Job, left: int) -> dict[str, Any] | None:

@@ -10,6 +10,7 @@ from sqlalchemy import ColumnElement, Select, delete, select, update
 from sqlalchemy.orm import Session
 
 from schemas.api.jobs import JobKind
+from service.database.connections import clock_expression
 from service.database.tables import TERMINAL, Job, JobAttempt, JobEvent, JobState, now_us
 from service.domain import webhooks
 
@@ -105,7 +106,7 @@ def tell_state(session: Session, job_id: str) -> None:
         data |= {"map_id": job.map_id, "map_version": job.map_version}
     if job.kind == JobKind.EXPORT:
         data["export_id"] = (job.request or {})["export_id"]
-    session.add(JobEvent(job_id=job_id, kind="state", data=data))
+    session.add(JobEvent(job_id=job_id, kind="state", data=data, created_us=clock_expression(session)))
     webhooks.record(session, job)
 
 
@@ -114,7 +115,7 @@ def tell_progress(session: Session, job: Job) -> None:
     drop_progress(session, job.id)
     shown = ("stage", "done", "total", "unit", "percent", "eta_low_s", "eta_high_s")
     data = {"attempt": job.attempt, **{name: getattr(job, name) for name in shown}}
-    session.add(JobEvent(job_id=job.id, kind="progress", data=data))
+    session.add(JobEvent(job_id=job.id, kind="progress", data=data, created_us=clock_expression(session)))
 
 
 def events_after(session: Session, job_id: str, last_id: int, *, limit: int = 500) -> list[JobEvent]:

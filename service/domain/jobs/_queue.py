@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
-from sqlalchemy import Select, or_, select, tuple_, update
+from sqlalchemy import ColumnElement, Select, case, func, or_, select, tuple_, update
 from sqlalchemy.orm import Session, load_only
 
+from schemas.api.jobs import JobKind
 from service.database.connections import clock_us
 from service.database.tables import Job, JobMember, JobState, now_us
 
@@ -49,9 +51,32 @@ def due_after(session: Session, job_id: str) -> list[Job]:
 
 
 def _due(session: Session) -> Select[Job]:
-    is_due = (Job.state == JobState.QUEUED) & (Job.not_before_us <= clock_us(session)) & (Job.waiting_for == 0)
     shown = load_only(Job.id, Job.kind, Job.fence, Job.created_us, raiseload=True)
-    return select(Job).where(is_due).options(shown).order_by(Job.created_us, Job.id)
+    return select(Job).where(_is_due(session)).options(shown).order_by(Job.created_us, Job.id)
+
+
+def _is_due(session: Session) -> ColumnElement[bool]:
+    return (Job.state == JobState.QUEUED) & (Job.not_before_us <= clock_us(session)) & (Job.waiting_for == 0)
+
+
+class Backlog(NamedTuple):
+    """Jobs of a kind that a worker could take now."""
+
+    jobs: int
+    since_us: int  # that wait longest
+
+
+def backlogs(session: Session) -> dict[JobKind, Backlog]:
+    """Jobs that wait for nothing but a worker, of each kind of which there are any."""
+    since_us = case((Job.not_before_us > Job.created_us, Job.not_before_us), else_=Job.created_us)
+    counted = select(Job.kind, func.count(), func.min(since_us)).where(_is_due(session)).group_by(Job.kind)
+    return {JobKind(kind): Backlog(jobs, first_us) for kind, jobs, first_us in session.execute(counted)}
+
+
+def count_stalled(session: Session, *, heard_before_us: int) -> int:
+    """Number of running jobs whose worker was last heard of before a time."""
+    silent = (Job.state == JobState.RUNNING) & (Job.heartbeat_us < heard_before_us)
+    return session.scalar(select(func.count()).select_from(Job).where(silent)) or 0
 
 
 def mark_enqueued(session: Session, job_ids: Sequence[str]) -> None:

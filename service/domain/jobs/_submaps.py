@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session, load_only
 from schemas.api.jobs import JobKind
 from schemas.api.problems import PROBLEM_TYPE, Problem
 from service.database.tables import TERMINAL, Job, JobMember, JobState, now_us
-from service.domain.jobs._dependencies import WAITS, resolve_child, tell_aggregations
+from service.domain.jobs._dependencies import WAITS, resolve_child, tell_aggregations, waiting_for
 from service.domain.jobs._queries import ACTIVE, change, tell_progress, tell_state
 
 SUBMAPS_STAGE = "submaps"
@@ -44,7 +44,7 @@ def look_at_submaps(session: Session, parent_id: str) -> None:
         if change(session, parent_id, WAITS, ended):
             tell_state(session, parent_id)
             resolve_child(session, session.get_one(Job, parent_id, populate_existing=True))
-    elif change(session, parent_id, WAITS, {"waiting_for": left}):
+    elif change(session, parent_id, WAITS, waiting_for(session, left)):
         tell_submaps(session, parent_id)
 
 

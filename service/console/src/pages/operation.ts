@@ -1,6 +1,6 @@
 import { get, send, setSession, type Session, type Status } from "../client";
 import { Badge, Content, Empty, Heading, Tile, Time, useLoad } from "../components";
-import { bytes, count, plural } from "../format";
+import { bytes, count, duration, plural } from "../format";
 import { html, type Shown } from "../html";
 import { link } from "../router";
 import { useEffect } from "preact/hooks";
@@ -25,7 +25,9 @@ function Parts({ status }: { status: Status }): Shown {
       <${Tile} label="Jobs that wait">${count(status.queue.queued)}<//>
       <${Tile} label="Jobs that run">${count(status.queue.running)}<//>
       <${Tile} label="Stalled jobs">${count(status.queue.stalled)}<//>
+      <${Tile} label="Longest wait for a worker">${status.queue.longest_wait_seconds > 0 ? duration(status.queue.longest_wait_seconds) : "none"}<//>
       <${Tile} label="Broker">${status.broker ? "answers" : "does not answer"}<//>
+      <${Tile} label="Reconciler">${status.reconciler ? "runs" : "does not run"}<//>
       <${Tile} label="Disk">${bytes(status.disk.free_bytes)} free of ${bytes(status.disk.total_bytes)}
         <progress max="1" value=${used} aria-label="disk in use"></progress><//>
       <${Tile} label="Uploads">${status.disk.accepts_uploads ? "are taken" : "are refused: the disk is full"}<//>
@@ -34,7 +36,7 @@ function Parts({ status }: { status: Status }): Shown {
     ${online.length === 0
       ? html`<${Empty}>No worker is online. Jobs are accepted and wait.<//>`
       : html`<${WorkerTable} workers=${online} label="Workers" />`}
-    ${offline.length > 0 && html`<details class="box"><summary>${plural(offline.length, "worker")} that ended within the last day</summary><${WorkerTable} workers=${offline} label="Workers that ended" /></details>`}
+    ${offline.length > 0 && html`<details class="box"><summary>${plural(offline.length, "worker")} that have been silent since</summary><${WorkerTable} workers=${offline} label="Silent workers" /></details>`}
     <p><a href="docs">Description of the API</a></p>`;
 }
 
