@@ -101,17 +101,17 @@ def _half(drive: Path, which: int, work: Path) -> Path:
 def _calibration(drive: Path, scene: Path) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Refined `rig_from_cam` (4, 4) of each camera with its repeatability (6,) in degrees and metres.
 
-    Halves have the same lenses, whose errors are in the sigmas and not in the differences.
+    Halves have the same lenses, whose errors are in the sigmas and not in the differences. A half that estimates them
+    has no repeatability, and its sigmas are what it knows.
     """
     mrasfm("reconstruct", drive, "--out", scene)
     cameras: dict[str, Any] = json.loads((scene / "calibration.json").read_text(encoding="utf-8"))["cameras"]
-    return {
-        name: (
-            matrix_from_pose(Pose(**camera["refined"]["rig_from_cam"])),
-            np.concatenate([camera["repeatability"]["rotation_deg"], camera["repeatability"]["translation_m"]]),
-        )
-        for name, camera in cameras.items()
-    }
+    found = {}
+    for name, camera in cameras.items():
+        stated = camera.get("repeatability") or camera["sigma"]
+        sigma = np.concatenate([stated["rotation_deg"], stated["translation_m"]])
+        found[name] = (matrix_from_pose(Pose(**camera["refined"]["rig_from_cam"])), sigma)
+    return found
 
 
 def without_positions(data: Path, work: Path) -> Iterator[Figure]:
