@@ -110,8 +110,11 @@ class _Disk(Collector):
         self._settings = settings
 
     def collect(self) -> Iterator[Metric]:
-        """Space where uploads are received."""
-        usage = disk_of_uploads(self._settings)
+        """Space where uploads are received; nothing of a disk that does not answer."""
+        try:
+            usage = disk_of_uploads(self._settings)
+        except OSError:
+            return
         yield _gauge("disk_free_bytes", "Free space where uploads are received", usage.free_bytes)
         yield _gauge("disk_total_bytes", "Size of the file system where uploads are received", usage.total_bytes)
 

@@ -49,11 +49,17 @@ class BoundedHttpProtocol(HttpToolsProtocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Extend uvicorn's method of this name."""
         super().connection_made(transport)
-        if hasattr(socket, "TCP_USER_TIMEOUT"):  # on Linux
-            # Without it an answer that nobody takes would be held for ever, with its file and what was read of it.
-            raw = transport.get_extra_info("socket")
-            raw.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNTAKEN_WITHIN_S))
+        self._bound_sending(transport.get_extra_info("socket"))
         self._wait_for_head()
+
+    @staticmethod
+    def _bound_sending(connection: socket.socket) -> None:
+        """End a connection whose answer nobody takes: it would be held for ever, with its file and what was read of it.
+
+        Only Linux, and only TCP, has such a bound.
+        """
+        if connection.family in (socket.AF_INET, socket.AF_INET6) and hasattr(socket, "TCP_USER_TIMEOUT"):
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * UNTAKEN_WITHIN_S))
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Extend uvicorn's method of this name."""
