@@ -106,6 +106,12 @@ def seam_checkpoint(a: str, b: str) -> str:
     return f"seam-{seam_name(a, b)}"
 
 
+def scenes_of_seam(file: str) -> tuple[str, str] | None:
+    """Names of the scenes whose seam's checkpoint is in a file; None where it is another stage's."""
+    found = re.fullmatch(rf"seam-([^{BETWEEN_SCENES}]+){BETWEEN_SCENES}([^{BETWEEN_SCENES}]+)\.npz", file)
+    return None if found is None else (found[1], found[2])
+
+
 def road_not_drawn(report: Mapping[str, Any]) -> str | None:
     """The reason that a scene's report gives for having no picture of its road; None where it gives none."""
     drawn = [stage for stage in report.get("stages", ()) if stage.get("stage") == Stage.PICTURES]

@@ -199,7 +199,7 @@ class AggregationHandler:
         """The shelf of every pair of its scenes, under these settings."""
         held = self._held
         ids = self._inputs.scene_ids
-        return MapShelf.from_scenes(held.map_id or "", held.project_id, scenes=ids, settings=held.settings)
+        return MapShelf(held.map_id or "", held.project_id, ids, settings_sha256(held.settings))
 
     def lay_out(self, folder: AttemptFolder, fetch: Fetch, progress: Callable[[int, int], None]) -> Attempt:
         """The scenes as folders, and the version that they are added to."""

@@ -7,13 +7,14 @@ import json
 import logging
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from schemas.artifacts import SCALES_CHECKPOINT, checkpoint_file, seam_checkpoint, submap_number
+from schemas.artifacts import SCALES_CHECKPOINT, checkpoint_file, scenes_of_seam, seam_checkpoint, submap_number
 from service.database.connections import Transactions
 from service.database.tables import Blob, Checkpoint, Drive, Map, MapCheckpoint, now_us
 from service.domain import jobs
@@ -22,12 +23,22 @@ from service.storage.artifacts import Fetch
 from service.storage.blob_writer import StoredFile
 from service.storage.transfers import fetch_each
 
+Found = TypeVar("Found")
+
 log = logging.getLogger("mrasfm.worker")
 
 
 def settings_sha256(settings: Mapping[str, Any]) -> str:
     """Tells apart the settings under which stages were finished, and scenes made."""
     return hashlib.sha256(json.dumps(dict(settings), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """Location of a finished stage's bytes."""
+
+    id: str
+    key: str
 
 
 @dataclass(frozen=True)
@@ -44,29 +55,39 @@ class MapShelf:
 
     Attributes
     ----------
-    digests
-        By the name of a stage's file, the digest of all that it is made of.
+    scenes
+        Ids of the map's scenes, by name.
     """
 
     map_id: str
     project_id: str
-    digests: Mapping[str, str]
+    scenes: Mapping[str, str]
+    settings_sha256: str
 
-    @staticmethod
-    def from_scenes(
-        map_id: str, project_id: str, *, scenes: Mapping[str, str], settings: Mapping[str, Any]
-    ) -> MapShelf:
-        """The shelf for scenes of a map, ids by name, under some settings."""
-        under = settings_sha256(settings)
-        digests = {
-            checkpoint_file(seam_checkpoint(a, b)): hashlib.sha256(f"{first} {second} {under}".encode()).hexdigest()
-            for a, first in scenes.items()
-            for b, second in scenes.items()
-            if a != b
-        }
-        together = f"{json.dumps(dict(scenes), sort_keys=True)} {under}"
-        digests[checkpoint_file(SCALES_CHECKPOINT)] = hashlib.sha256(together.encode()).hexdigest()
-        return MapShelf(map_id, project_id, digests)
+    def digest(self, file: str) -> str | None:
+        """The digest of all that a stage is made of, by its file's name; None where the map has no such stage."""
+        if file == checkpoint_file(SCALES_CHECKPOINT):
+            return self._sha256(json.dumps(dict(self.scenes), sort_keys=True))
+        first, second = (self.scenes.get(name) for name in scenes_of_seam(file) or ("", ""))
+        return None if first is None or second is None or first == second else self._of_pair(first, second)
+
+    def find(self, known: Mapping[str, Found]) -> dict[str, Found]:
+        """Stages of the map that are known by their digest, by the names of their files."""
+        if not known:
+            return {}
+        together = checkpoint_file(SCALES_CHECKPOINT)
+        found = {together: known.get(self.digest(together) or "")}
+        # One after the other: a thousand scenes have a million pairs, of which three thousand are seams.
+        for (a, first), (b, second) in permutations(self.scenes.items(), 2):
+            if (kept := known.get(self._of_pair(first, second))) is not None:
+                found[checkpoint_file(seam_checkpoint(a, b))] = kept
+        return {name: kept for name, kept in found.items() if kept is not None}
+
+    def _of_pair(self, first: str, second: str) -> str:
+        return self._sha256(f"{first} {second}")
+
+    def _sha256(self, inputs: str) -> str:
+        return hashlib.sha256(f"{inputs} {self.settings_sha256}".encode()).hexdigest()
 
 
 Shelf = DriveShelf | MapShelf
@@ -110,14 +131,6 @@ def _forget(session: Session, blob_id: str) -> None:
     blobs.lose(session, blob_id)
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """Location of a finished stage's bytes."""
-
-    id: str
-    key: str
-
-
 def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:
     """The finished stages, by name."""
     if isinstance(shelf, DriveShelf):
@@ -128,8 +141,7 @@ def _shelved(session: Session, shelf: Shelf) -> dict[str, _Kept]:
     rows = session.execute(
         of_maps.where(MapCheckpoint.project_id == shelf.project_id).order_by(MapCheckpoint.created_us)
     )
-    known = {inputs: _Kept(*kept) for inputs, *kept in rows}  # the newest
-    return {name: known[inputs] for name, inputs in shelf.digests.items() if inputs in known}
+    return shelf.find({inputs: _Kept(*kept) for inputs, *kept in rows})  # the newest
 
 
 def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bool:
@@ -152,7 +164,7 @@ def keep(session: Session, shelf: Shelf, stored: Mapping[str, StoredFile]) -> bo
         return False
     kept = False
     for name, file in stored.items():
-        if isinstance(shelf, MapShelf) and name not in shelf.digests:
+        if isinstance(shelf, MapShelf) and shelf.digest(name) is None:
             continue
         blob = blobs.record(session, project_id=owner.project_id, within_quota=False, **file.identity)
         checkpoint = _find(session, shelf, name)
@@ -200,7 +212,7 @@ def _find(session: Session, shelf: Shelf, name: str) -> Checkpoint | MapCheckpoi
         case DriveShelf():
             return session.get(Checkpoint, (shelf.drive_id, shelf.settings_sha256, name))
         case MapShelf():
-            return session.get(MapCheckpoint, (shelf.map_id, shelf.digests[name], _SEAM))
+            return session.get(MapCheckpoint, (shelf.map_id, shelf.digest(name), _SEAM))
 
 
 def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
@@ -213,7 +225,7 @@ def _new(shelf: Shelf, name: str, blob_id: str) -> Checkpoint | MapCheckpoint:
             return MapCheckpoint(
                 map_id=shelf.map_id,
                 project_id=shelf.project_id,
-                inputs_sha256=shelf.digests[name],
+                inputs_sha256=shelf.digest(name),
                 name=_SEAM,
                 blob_id=blob_id,
             )

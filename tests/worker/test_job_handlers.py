@@ -12,7 +12,7 @@ from sqlalchemy.exc import OperationalError
 from schemas.api.jobs import JobKind
 from service.database.connections import Database
 from service.domain import checkpoints, jobs
-from service.domain.checkpoints import MapShelf
+from service.domain.checkpoints import MapShelf, settings_sha256
 from service.domain.drive_checkout import check_out
 from service.settings import Settings
 from service.storage.blob_writer import file_sha256, store_file
@@ -36,13 +36,20 @@ def test_an_aggregation_reads_its_inputs_where_it_needs_them(tmp_path: Path) -> 
 
 def test_every_pair_of_scenes_has_a_checkpoint_of_its_own_name() -> None:
     scenes = {name: f"scn_{number}" for number, name in enumerate(("a", "a--b", "b--c", "c"))}
-    shelf = MapShelf.from_scenes("map_1", "prj_1", scenes=scenes, settings={})
+    shelf = MapShelf("map_1", "prj_1", scenes, settings_sha256({}))
     seams = {f"seam-{a}~{b}.npz" for a, b in permutations(scenes, 2)}
-    assert set(shelf.digests) == {*seams, "scales.npz"}, "and lengths of scenes without positions one for all"
-    assert len(shelf.digests) == len(set(shelf.digests.values())) == 13
-    fewer = MapShelf.from_scenes("map_1", "prj_1", scenes={"a": "scn_0", "c": "scn_3"}, settings={})
-    assert shelf.digests["seam-a~c.npz"] == fewer.digests["seam-a~c.npz"]
-    assert shelf.digests["scales.npz"] != fewer.digests["scales.npz"]
+    digests = {name: shelf.digest(name) or "" for name in (*seams, "scales.npz")}
+    assert "" not in digests.values()
+    assert len(set(digests.values())) == 13, "and lengths of scenes without positions one for all"
+    assert shelf.find({digest: digest for digest in digests.values()}) == digests
+    assert shelf.find({digests["seam-a~c.npz"]: 1}) == {"seam-a~c.npz": 1}
+    others = ("seam-a~d.npz", "seam-a~a.npz", "seam-a.npz", "seam-a~c", "features.npz", "../seam-a~c.npz")
+    assert [shelf.digest(name) for name in others] == [None] * len(others)
+    fewer = MapShelf("map_1", "prj_1", {"a": "scn_0", "c": "scn_3"}, settings_sha256({}))
+    assert fewer.digest("seam-a~c.npz") == digests["seam-a~c.npz"]
+    assert fewer.digest("scales.npz") != digests["scales.npz"]
+    under_others = MapShelf("map_1", "prj_1", scenes, settings_sha256({"seed": 1}))
+    assert {under_others.digest(name) for name in digests}.isdisjoint(digests.values())
 
 
 def test_a_sub_map_brings_its_own_stages_and_the_plans(tmp_path: Path) -> None:

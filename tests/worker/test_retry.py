@@ -17,7 +17,7 @@ from sqlalchemy import update
 import worker.checkpoints
 from service.database.tables import Blob, Checkpoint, Job, Project, now_us
 from service.domain import checkpoints, jobs
-from service.domain.checkpoints import DriveShelf, MapShelf, Shelf
+from service.domain.checkpoints import DriveShelf, MapShelf, Shelf, settings_sha256
 from service.storage.artifacts import ArtifactStore
 from service.storage.blob_writer import StoredFile, file_sha256, store_file
 from service.storage.process_folder import process_folder
@@ -275,7 +275,7 @@ def test_checkpoint_that_nobody_finds_again_is_no_progress(world: World, brief_d
     (tmp_path / "stages").mkdir()
     (tmp_path / "stages" / "features.npz").write_bytes(b"features")
     drive_id = world.add_drive(brief_drive)
-    gone = MapShelf.from_scenes("map_gone", world.project_id, scenes={}, settings={})
+    gone = MapShelf("map_gone", world.project_id, {}, settings_sha256({}))
     with keeper(world, gone, tmp_path, drive_id=drive_id):
         pass
     with world.database.read() as session:
