@@ -66,6 +66,7 @@ def adjust_in_rounds(
         done += 1
         if progress is not None:
             progress(min(done, ROUNDS), ROUNDS + 1)
+    result.is_steady = steady
 
 
 def hear_given_rotations(mapper: Mapper, result: Refinement, free_units: Bools) -> None:

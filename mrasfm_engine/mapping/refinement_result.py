@@ -64,6 +64,7 @@ class Refinement:
     recalibrated: Bools = field(default_factory=lambda: np.zeros(0, dtype=np.bool_))  # (cameras,) whose pose varied
     as_grown: Parts | None = None  # the scene before cameras were put back to where they began
     adjustments: list[Report] = field(default_factory=list)
+    is_steady: bool = True  # the last one left the weights of positions and the cameras' time offsets as they were
     observations_dropped: int = 0
     points_dropped: int = 0
     units_dropped: list[int] = field(default_factory=list)

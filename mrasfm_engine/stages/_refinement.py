@@ -30,6 +30,7 @@ from mrasfm_engine.mapping.receiver_findings import (
 )
 from mrasfm_engine.mapping.refinement import refine
 from mrasfm_engine.mapping.scene_builder import build_scene
+from mrasfm_engine.mapping.unfinished_refinement import unfinished_findings
 from mrasfm_engine.matching.prior_trajectory import PriorTrajectory
 from mrasfm_engine.scene.rectified_cameras import rig_with_models
 from mrasfm_engine.scene.scene import ImageFeatures, Scene
@@ -172,6 +173,7 @@ def _refined(
     findings += mapping_report.contradicting_image_findings(mapper)
     findings += mapping_report.motion_findings(mapper) + motion_jump_findings(mapper)
     findings += mapping_report.scale_findings(mapper, refined) + length_findings(mapper, refined)
+    findings += unfinished_findings(mapper, refined)
     report = {
         **mapping_report.describe_refinement(mapper, refined),
         **mapping_report.describe_between(mapper, between),
