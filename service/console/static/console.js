@@ -229,7 +229,7 @@ import{a as X}from"./chunk-Y3GPSS3G.js";import{A as z,B as W,C as F,D as G,E as 
       <${i} label="Jobs that wait">${l(e.queue.queued)}<//>
       <${i} label="Jobs that run">${l(e.queue.running)}<//>
       <${i} label="Stalled jobs">${l(e.queue.stalled)}<//>
-      <${i} label="Longest wait for a worker">${e.queue.longest_wait_seconds>0?H(e.queue.longest_wait_seconds):"none"}<//>
+      <${i} label="Longest wait">${e.queue.longest_wait_seconds>0?H(e.queue.longest_wait_seconds):"none"}<//>
       <${i} label="Broker">${e.broker?"answers":"does not answer"}<//>
       <${i} label="Reconciler">${e.reconciler?"runs":"does not run"}<//>
       <${i} label="Disk">${P(e.disk.free_bytes)} free of ${P(e.disk.total_bytes)}

@@ -25,7 +25,7 @@ function Parts({ status }: { status: Status }): Shown {
       <${Tile} label="Jobs that wait">${count(status.queue.queued)}<//>
       <${Tile} label="Jobs that run">${count(status.queue.running)}<//>
       <${Tile} label="Stalled jobs">${count(status.queue.stalled)}<//>
-      <${Tile} label="Longest wait for a worker">${status.queue.longest_wait_seconds > 0 ? duration(status.queue.longest_wait_seconds) : "none"}<//>
+      <${Tile} label="Longest wait">${status.queue.longest_wait_seconds > 0 ? duration(status.queue.longest_wait_seconds) : "none"}<//>
       <${Tile} label="Broker">${status.broker ? "answers" : "does not answer"}<//>
       <${Tile} label="Reconciler">${status.reconciler ? "runs" : "does not run"}<//>
       <${Tile} label="Disk">${bytes(status.disk.free_bytes)} free of ${bytes(status.disk.total_bytes)}
