@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import anyio
 
 from service.api.http.event_streams import EventStreams
-from service.api.http.fair_places import FairPlaces
+from service.api.http.fair_places import FairPlaces, FairThreads
 from service.database.connections import Database
 from service.domain.keys import KeyRing
 from service.domain.request_holds import HoldKeeper
@@ -39,9 +39,8 @@ class Context:
     large_bodies: FairPlaces  # JSON bodies that are in memory at one time
     large_documents: FairPlaces  # of these, what is parsed and recorded at one time
     streams: EventStreams
-    # Of their own, so that what takes minutes leaves the threads of all other requests alone.
-    commits: anyio.CapacityLimiter
-    unpacking: anyio.CapacityLimiter
+    commits: FairThreads
+    unpacking: FairThreads
     archive_watches: KeptWatches = field(default_factory=KeptWatches)
 
     @classmethod
@@ -63,8 +62,8 @@ class Context:
             ),
             large_documents=FairPlaces(1, per_project=1, waiting_per_project=_LARGE_BODIES),
             streams=EventStreams(settings.max_event_streams),
-            commits=anyio.CapacityLimiter(_COMMITS),
-            unpacking=anyio.CapacityLimiter(_UNPACKING),
+            commits=FairThreads(_COMMITS),
+            unpacking=FairThreads(_UNPACKING),
         )
 
     def close(self) -> None:

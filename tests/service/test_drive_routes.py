@@ -423,7 +423,7 @@ def test_slow_checks_leave_the_api_to_others(client: Client, monkeypatch: pytest
     for thread in threads:
         thread.start()
     try:
-        wait_until(lambda: client.api.context.commits.statistics().tasks_waiting == 43, "the commits")
+        wait_until(lambda: client.api.context.commits.places.waiting == 43, "the commits")
         assert client.get(f"/v1/drives/{drive_id}", timeout=20).json()["state"] == "OPEN"
     finally:
         go_on.touch()

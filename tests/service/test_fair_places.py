@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -9,7 +10,7 @@ import anyio
 import pytest
 from anyio.abc import TaskGroup
 
-from service.api.http.fair_places import FairPlaces
+from service.api.http.fair_places import FairPlaces, FairThreads
 from service.errors import ServiceError
 
 PLENTY_S = 60.0
@@ -119,3 +120,31 @@ def test_not_too_many_of_a_project_wait() -> None:
         assert crowd.places.waiting == 3, "another project's may wait"
 
     in_a_crowd(test, FairPlaces(1, per_project=1, waiting_per_project=2))
+
+
+def test_a_thread_goes_to_the_project_that_comes_behind_many_of_another() -> None:
+    threads, go_on, served = FairThreads(1), threading.Event(), list[str]()
+
+    def serve(name: str) -> str:
+        assert go_on.wait(PLENTY_S)
+        served.append(name)
+        if name == "a2":
+            raise ValueError(name)
+        return name
+
+    async def ask(name: str) -> None:
+        try:
+            assert await threads.run(name[0], serve, name) == name
+        except ValueError:
+            assert name == "a2"
+
+    async def run() -> None:
+        async with anyio.create_task_group() as tasks:
+            for name in ("a1", "a2", "a3", "b1", "b2"):
+                tasks.start_soon(ask, name)
+                await anyio.wait_all_tasks_blocked()
+            go_on.set()
+
+    anyio.run(run)
+    assert served == ["a1", "b1", "a2", "b2", "a3"]
+    assert (threads.places.held, threads.places.waiting) == (0, 0)

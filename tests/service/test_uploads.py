@@ -307,7 +307,7 @@ def test_an_archive(client: Client, drive: TinyDrive) -> None:
 def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
     client: Client, api: Api, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    unpacking, go_on = api.context.unpacking, threading.Event()
+    unpacking, go_on = api.context.unpacking.places, threading.Event()
     unpack_now = file_ingest.keep_archive
 
     def unpack_later(*given: Any) -> Any:
@@ -323,15 +323,15 @@ def test_only_what_unpacks_takes_a_place_of_those_that_unpack(
         thread.start()
         return thread
 
-    zips = [tiny_drive(seed=f"turn{i}").zipped() for i in range(int(unpacking.total_tokens) + 1)]
+    zips = [tiny_drive(seed=f"turn{i}").zipped() for i in range(3)]
     *urls, last = [begin_archive(client, client.create(), zipped) for zipped in zips]
     try:
         sending = [send(url, 0, zipped) for url, zipped in zip(urls, zips[:-1], strict=True)]
-        wait_until(lambda: unpacking.available_tokens == 0, "that all places are taken")
+        wait_until(lambda: unpacking.held == 2, "that all places are taken")
         client.timeout = 5
         assert patch(client, last, 0, zips[-1][:100]).status_code == 204
         sending.append(send(last, 100, zips[-1][100:]))
-        wait_until(lambda: unpacking.statistics().tasks_waiting == 1, "that the last one waits")
+        wait_until(lambda: unpacking.waiting == 1, "that the last one waits")
         with api.database.read() as session:
             kept_bytes = session.get_one(Upload, last.rsplit("/", 1)[1]).kept_bytes
         assert kept_bytes == len(zips[-1]), "what came does not wait"

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import anyio
+import anyio.to_thread
 
 from service.errors import Busy, ServiceError, TooManyLargeBodies
+
+Result = TypeVar("Result")
 
 _RETRY_AFTER_S = 10
 
@@ -127,6 +133,22 @@ class FairPlaces:
             del self._held[project_id]
             if all(waiter.project_id != project_id for waiter in self._waiters):
                 self._last_grant.pop(project_id, None)
+
+
+class FairThreads:
+    """Threads of their own that projects share, for what takes minutes: those of all other requests are left alone.
+
+    Who waits for one waits as long as it takes: what came with the request is here already.
+    """
+
+    def __init__(self, threads: int) -> None:
+        self.places = FairPlaces(threads, per_project=threads, waiting_per_project=sys.maxsize)
+        self._limiter = anyio.CapacityLimiter(threads)
+
+    async def run(self, project_id: str, function: Callable[..., Result], *given: object) -> Result:
+        """The function's result; it runs in a thread, once it is the project's turn."""
+        async with self.places.place(project_id, within_s=math.inf):
+            return await anyio.to_thread.run_sync(function, *given, limiter=self._limiter)
 
 
 def _too_many(within_s: float) -> ServiceError:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Annotated
 
-import anyio.to_thread
 from fastapi import APIRouter, Depends, Query, Response
 from sqlalchemy.orm import Session
 from starlette.concurrency import run_in_threadpool
@@ -184,7 +183,7 @@ async def commit_drive(drive_id: str, once: IdempotentDep, caller: CallerDep, co
         )
         return answer(200, _shown(session, drive), waiting=(job,))
 
-    return await anyio.to_thread.run_sync(partial(once, effect, prepare=prepare), limiter=context.commits)
+    return await context.commits.run(caller.project_id, partial(once, effect, prepare=prepare))
 
 
 @router.get(

@@ -196,7 +196,7 @@ async def put_archive(
     with archive:
         unpacking = partial(keep_archive, context, caller.project_id, drive_id, archive, replace)
         try:
-            return await anyio.to_thread.run_sync(unpacking, limiter=context.unpacking)
+            return await context.unpacking.run(caller.project_id, unpacking)
         except ServiceError as error:
             _refuse_form(request, error)
             raise

@@ -262,8 +262,10 @@ class _Held:
         the thread that has it takes no other place, and needs none of those who wait.
         """
         if self.offset == self.upload.size_bytes and not self.upload.is_done:
-            limiter = self._context.unpacking if self.upload.path is None else self._context.disk
-            await anyio.to_thread.run_sync(self._complete, sha256, limiter=limiter)
+            if self.upload.path is None:
+                await self._context.unpacking.run(self.upload.project_id, self._complete, sha256)
+            else:
+                await anyio.to_thread.run_sync(self._complete, sha256, limiter=self._context.disk)
 
     def _complete(self, sha256: str | None) -> None:
         upload = self.upload
