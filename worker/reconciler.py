@@ -57,7 +57,6 @@ class Reconciler:
         self._broker_was_there = True
         self._clock_guard = ClockGuard(settings.lease_seconds)
         self._limits = jobs.RetryLimits.from_settings(settings)
-        self._noted_s: dict[str, float] = {}
 
     def close(self) -> None:
         """Close the connections to the database."""
@@ -91,29 +90,19 @@ class Reconciler:
         first_s: float,
         rests: float = 0.0,
     ) -> None:
+        """Make a pass again and again, and note those that went well where the status and the metrics find them."""
         ended.wait(first_s)
+        noted_s = math.inf if what == passes.ORPHANS else -math.inf  # which notes when the store was really listed
         while not ended.is_set():
             begun_s = time.monotonic()
-            if self._try(what, step) and what != passes.ORPHANS:
-                self._try(what, lambda: self._note(what))
+            try:
+                step()
+                if time.monotonic() > noted_s + _NOTED_EVERY_S:
+                    self._database.transact(lambda session: passes.note(session, what))
+                    noted_s = time.monotonic()
+            except Exception:  # the next pass tries again
+                log.exception("a pass failed", extra={"fields": {"pass": what}})
             ended.wait(max(every_s, rests * (time.monotonic() - begun_s)))
-
-    def _try(self, what: str, step: Callable[[], object]) -> bool:
-        """Make a pass, or a part of one; whether it went well."""
-        try:
-            step()
-        except Exception:  # the next pass tries again
-            log.exception("a pass failed", extra={"fields": {"pass": what}})
-            return False
-        return True
-
-    def _note(self, what: str) -> None:
-        """Note the pass where the status and the metrics find it."""
-        if time.monotonic() < self._noted_s.get(what, -math.inf) + _NOTED_EVERY_S:
-            return
-        with self._database.write() as session:
-            passes.note(session, what)
-        self._noted_s[what] = time.monotonic()
 
     def reconcile_jobs(self) -> None:
         """Free jobs whose worker is silent, and wake workers up for those that wait and have no message."""
@@ -166,8 +155,7 @@ class Reconciler:
     def collect_orphans(self) -> None:
         """Delete bytes that no record names, once a day by all reconcilers: all of the store is listed for it."""
         with self._database.read() as session:
-            last = passes.last_us(session).get(passes.ORPHANS)
-            age_us = None if last is None else clock_us(session) - last
+            age_us = passes.ages_us(session).get(passes.ORPHANS)
         if age_us is not None and 0 <= age_us < _ORPHANS_EVERY_US:
             return
         _tell(collect_orphans(self._database, self._artifacts))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Iterator, Mapping
-from typing import NamedTuple
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import GaugeMetricFamily, Metric
@@ -24,13 +23,6 @@ from service.domain.workers import ONLINE_US
 from service.settings import Settings
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
-
-
-class DiskUsage(NamedTuple):
-    """Space of a file system."""
-
-    total_bytes: int
-    free_bytes: int
 
 
 class Metrics:
@@ -83,22 +75,21 @@ class _Records(Collector):
         yield from found
 
     def _recorded(self, session: Session) -> Iterator[Metric]:
-        now = clock_us(session)
         yield _family("jobs", "Jobs by state", "state", _by_state(session, Job.state), names=JobState)
-        stalled = jobs.count_stalled(session, heard_before_us=now - int(self._settings.stalled_seconds * 1e6))
+        stalled = jobs.count_stalled(session, stalled_s=self._settings.stalled_seconds)
         yield _gauge("jobs_stalled", "Running jobs without a recent heartbeat", stalled)
         backlogs = jobs.backlogs(session)
         due = {str(kind): backlog.jobs for kind, backlog in backlogs.items()}
         yield _family("jobs_due", "Jobs that wait for nothing but a worker, by kind", "kind", due, names=JobKind)
-        waits_s = {str(kind): max(0, now - backlog.since_us) / 1e6 for kind, backlog in backlogs.items()}
+        waits_s = {str(kind): backlog.longest_wait_us / 1e6 for kind, backlog in backlogs.items()}
         about = "Time for which the oldest of them has waited"
         yield _family("jobs_due_longest_wait_seconds", about, "kind", waits_s, names=JobKind)
         messages = _by_state(session, WebhookDelivery.state)
         about = "Messages of webhooks by state, of the last month"
         yield _family("webhook_messages", about, "state", messages, names=DeliveryState)
-        online = select(func.count()).select_from(WorkerSeen).where(WorkerSeen.seen_us > now - ONLINE_US)
+        online = select(func.count()).select_from(WorkerSeen).where(WorkerSeen.seen_us > clock_us(session) - ONLINE_US)
         yield _gauge("workers_online", "Workers that reported lately", session.scalar(online) or 0)
-        ages_s = {name: max(0, now - done_us) / 1e6 for name, done_us in passes.last_us(session).items()}
+        ages_s = {name: max(0, age_us) / 1e6 for name, age_us in passes.ages_us(session).items()}
         about = "Time since a reconciler last made each of its passes"
         yield _family("reconciler_pass_age_seconds", about, "pass", ages_s, names=ages_s)
         used = session.scalar(select(func.coalesce(func.sum(Project.used_bytes), 0))) or 0
@@ -112,18 +103,18 @@ class _Disk(Collector):
     def collect(self) -> Iterator[Metric]:
         """Space where uploads are received; nothing of a disk that does not answer."""
         try:
-            usage = disk_of_uploads(self._settings)
+            free_bytes, total_bytes = disk_of_uploads(self._settings)
         except OSError:
             return
-        yield _gauge("disk_free_bytes", "Free space where uploads are received", usage.free_bytes)
-        yield _gauge("disk_total_bytes", "Size of the file system where uploads are received", usage.total_bytes)
+        yield _gauge("disk_free_bytes", "Free space where uploads are received", free_bytes)
+        yield _gauge("disk_total_bytes", "Size of the file system where uploads are received", total_bytes)
 
 
-def disk_of_uploads(settings: Settings) -> DiskUsage:
-    """Space where uploads are received."""
+def disk_of_uploads(settings: Settings) -> tuple[int, int]:
+    """Bytes that are free where uploads are received, and bytes of that file system."""
     settings.spool_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
-    total_bytes, _, free_bytes = shutil.disk_usage(settings.spool_dir)
-    return DiskUsage(total_bytes, free_bytes)
+    usage = shutil.disk_usage(settings.spool_dir)
+    return usage.free, usage.total
 
 
 def _gauge(name: str, about: str, value: float) -> Metric:

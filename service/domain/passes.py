@@ -19,12 +19,13 @@ def note(session: Session, name: str) -> None:
     session.merge(Pass(name=name, done_us=clock_us(session)))  # other hosts compare it
 
 
-def last_us(session: Session) -> dict[str, int]:
-    """Time of the last of each pass that was ever made."""
-    return {row.name: row.done_us for row in session.scalars(select(Pass))}
+def ages_us(session: Session) -> dict[str, int]:
+    """Time since the last of each pass that was ever made; below zero where the clock was set back since."""
+    now = clock_us(session)
+    return {row.name: now - row.done_us for row in session.scalars(select(Pass))}
 
 
 def are_made(session: Session, *, every_s: float) -> bool:
     """True where a reconciler has looked after the jobs lately, who does it every `every_s`."""
-    last = last_us(session).get(JOBS)
-    return last is not None and clock_us(session) - last < 1e6 * max(_ALIVE_S, _MISSED * every_s)
+    age_us = ages_us(session).get(JOBS)
+    return age_us is not None and age_us < 1e6 * max(_ALIVE_S, _MISSED * every_s)

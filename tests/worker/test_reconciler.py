@@ -124,7 +124,7 @@ def test_jobs_do_not_wait_for_the_sweep(world: World, brief_drive: Path, monkeyp
 def passes_of(world: World) -> set[str]:
     """Passes that have been noted: those that went well."""
     with world.database.read() as session:
-        return set(passes.last_us(session))
+        return set(passes.ages_us(session))
 
 
 def test_a_pass_that_fails_is_not_noted(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -276,7 +276,7 @@ def test_objects_that_no_record_names(world: World, brief_drive: Path, monkeypat
     monkeypatch.setattr(garbage_collection, "now_us", tomorrow)
     reconciler.collect_orphans()
     assert unnamed in objects(world), "the store was listed within the day, maybe by a process that is gone"
-    monkeypatch.setattr(worker.reconciler, "clock_us", lambda session: tomorrow())
+    monkeypatch.setattr(passes, "clock_us", lambda session: tomorrow())
     reconciler.collect_orphans()
     assert objects(world) == named
     assert world.drive(drive_id).state == "COMMITTED"

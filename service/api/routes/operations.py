@@ -18,7 +18,6 @@ from service.api.dependencies import CallerDep, ContextDep, moment
 from service.api.http.responses import gives, problems
 from service.api.metrics import CONTENT_TYPE, Metrics, disk_of_uploads
 from service.api.readiness import Readiness
-from service.api.routes.job_views import stalled_before_us
 from service.database.connections import clock_us
 from service.database.tables import Job, JobState, WorkerSeen
 from service.domain import jobs, passes
@@ -106,21 +105,21 @@ def _queue(session: Session, context: Context) -> QueueStatus:
     waiting = Job.state.in_((JobState.QUEUED, JobState.RUNNING))
     by_state = select(Job.state, func.count()).where(waiting).group_by(Job.state)
     counts: dict[str, int] = {row[0]: row[1] for row in session.execute(by_state)}
-    waits_us = [clock_us(session) - backlog.since_us for backlog in jobs.backlogs(session).values()]
+    waits_us = (backlog.longest_wait_us for backlog in jobs.backlogs(session).values())
     return QueueStatus(
         queued=counts.get(JobState.QUEUED, 0),
         running=counts.get(JobState.RUNNING, 0),
-        stalled=jobs.count_stalled(session, heard_before_us=stalled_before_us(session, context.settings)),
-        longest_wait_seconds=max([0, *waits_us]) / 1e6,
+        stalled=jobs.count_stalled(session, stalled_s=context.settings.stalled_seconds),
+        longest_wait_seconds=max(waits_us, default=0) / 1e6,
     )
 
 
 def _disk(context: Context) -> DiskStatus:
-    usage = disk_of_uploads(context.settings)
+    free_bytes, total_bytes = disk_of_uploads(context.settings)
     return DiskStatus(
-        free_bytes=usage.free_bytes,
-        total_bytes=usage.total_bytes,
-        accepts_uploads=usage.free_bytes > context.settings.min_free_disk_bytes,
+        free_bytes=free_bytes,
+        total_bytes=total_bytes,
+        accepts_uploads=free_bytes > context.settings.min_free_disk_bytes,
     )
 
 

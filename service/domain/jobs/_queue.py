@@ -63,19 +63,20 @@ class Backlog(NamedTuple):
     """Jobs of a kind that a worker could take now."""
 
     jobs: int
-    since_us: int  # that wait longest
+    longest_wait_us: int
 
 
 def backlogs(session: Session) -> dict[JobKind, Backlog]:
     """Jobs that wait for nothing but a worker, of each kind of which there are any."""
     since_us = case((Job.not_before_us > Job.created_us, Job.not_before_us), else_=Job.created_us)
     counted = select(Job.kind, func.count(), func.min(since_us)).where(_is_due(session)).group_by(Job.kind)
-    return {JobKind(kind): Backlog(jobs, first_us) for kind, jobs, first_us in session.execute(counted)}
+    rows, now = session.execute(counted).all(), clock_us(session)
+    return {JobKind(kind): Backlog(jobs, max(0, now - first_us)) for kind, jobs, first_us in rows}
 
 
-def count_stalled(session: Session, *, heard_before_us: int) -> int:
-    """Number of running jobs whose worker was last heard of before a time."""
-    silent = (Job.state == JobState.RUNNING) & (Job.heartbeat_us < heard_before_us)
+def count_stalled(session: Session, *, stalled_s: float) -> int:
+    """Number of running jobs whose worker was not heard of for a time."""
+    silent = (Job.state == JobState.RUNNING) & (Job.heartbeat_us < clock_us(session) - int(1e6 * stalled_s))
     return session.scalar(select(func.count()).select_from(Job).where(silent)) or 0
 
 
